@@ -1,0 +1,345 @@
+"""Frozen configuration: it shapes the program and is checked before tracing.
+
+`EnvConfig` keeps Safety Gym's keys letter for letter, so that a preset can be
+compared with the original's. Every default marked *ours* is a choice that neither
+the AutoCost paper nor Safety Gym settles.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Algorithm = Literal["ppo_lagrangian", "cpo"]
+Selection = Literal["paper", "random"]
+LIDAR_BINS = 8  # the paper's constraint lidar: the intrinsic network's input
+THETA_SIZE = 41
+
+
+def _require(ok: bool, name: str, allowed: str, got: Any) -> None:
+    if not ok:
+        raise ValueError(f"{name} must be {allowed}, got {got!r}")
+
+
+def _require_positive(config: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        ok = math.isfinite(value) and value > 0
+        _require(ok, name, "finite and > 0", value)
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """One Safety Gym world; lengths in metres, names as in Safety Gym's engine.
+
+    The default is the paper's training environment, Goal-Hazard-Point. Counts,
+    radii, extents and keepouts are ours (the paper does not state them): engine
+    defaults where Safety Gym has one, 8 hazards as in its Goal1.
+    """
+
+    task: Literal["Goal"] = "Goal"
+    constraint: Literal["Hazard"] = "Hazard"
+    robot: Literal["Point"] = "Point"
+    num_steps: int = 1000
+    frameskip_binom_n: int = 10
+    placements_extents: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
+    placements_margin: float = 0.0
+    robot_keepout: float = 0.4
+    goal_size: float = 0.3
+    goal_keepout: float = 0.4
+    hazards_num: int = 8
+    hazards_size: float = 0.3
+    hazards_keepout: float = 0.4
+    hazards_cost: float = 1.0
+    constrain_indicator: bool = False
+    lidar_num_bins: int = LIDAR_BINS
+    lidar_max_dist: float | None = None
+    lidar_exp_gain: float = 1.0
+    lidar_alias: bool = True
+    reward_distance: float = 1.0
+    reward_goal: float = 1.0
+    reward_clip: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("task", ("Goal",)),
+            ("constraint", ("Hazard",)),
+            ("robot", ("Point",)),
+        ):
+            value = getattr(self, name)
+            _require(value in allowed, name, f"one of {', '.join(allowed)}", value)
+        for name in ("num_steps", "frameskip_binom_n", "lidar_num_bins", "hazards_num"):
+            _require(getattr(self, name) >= 1, name, ">= 1", getattr(self, name))
+        _require_positive(
+            self,
+            "goal_size",
+            "goal_keepout",
+            "robot_keepout",
+            "hazards_size",
+            "hazards_keepout",
+            "lidar_exp_gain",
+            "reward_clip",
+        )
+        if self.lidar_max_dist is not None:
+            _require_positive(self, "lidar_max_dist")
+        x0, y0, x1, y1 = self.placements_extents
+        wide = 2 * max(self.robot_keepout, self.goal_keepout, self.hazards_keepout)
+        _require(
+            x1 - x0 > wide and y1 - y0 > wide,
+            "placements_extents",
+            f"(xmin, ymin, xmax, ymax), more than {wide} m wide and high",
+            self.placements_extents,
+        )
+
+    @property
+    def name(self) -> str:
+        """`{task}-{constraint}-{robot}`, as the paper writes it."""
+        return f"{self.task}-{self.constraint}-{self.robot}"
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Hyper-parameters of PPO, PPO-Lagrangian and CPO; defaults are the paper's.
+
+    Where the paper is silent they are Safety Gym's starter agents'. An update makes
+    `policy_passes` x `policy_minibatches` policy steps (CPO: always one full-batch
+    step) and `value_passes` x `value_minibatches` critic steps.
+    """
+
+    hidden_sizes: tuple[int, ...] = (256, 256)
+    log_std_init: float = -0.5
+    gamma: float = 0.99
+    gae_lambda: float = 0.97
+    cost_gamma: float = 0.99
+    cost_gae_lambda: float = 0.97
+    policy_lr: float = 4e-4
+    policy_passes: int = 80
+    policy_minibatches: int = 1
+    clip_eps: float = 0.2
+    target_kl: float = 0.01
+    kl_stop_factor: float = 1.2
+    value_lr: float = 1e-3
+    value_passes: int = 80
+    value_minibatches: int = 1
+    multiplier_init: float = 1.0
+    multiplier_lr: float = 0.05
+    cg_iterations: int = 10
+    cg_damping: float = 0.1
+    backtrack_steps: int = 10
+    backtrack_ratio: float = 0.8
+
+    def __post_init__(self) -> None:
+        for name in (
+            "policy_passes",
+            "policy_minibatches",
+            "value_passes",
+            "value_minibatches",
+            "cg_iterations",
+            "backtrack_steps",
+        ):
+            _require(getattr(self, name) >= 1, name, ">= 1", getattr(self, name))
+        _require(
+            all(size >= 1 for size in self.hidden_sizes),
+            "hidden_sizes",
+            "a tuple of sizes >= 1",
+            self.hidden_sizes,
+        )
+        for name in ("gamma", "cost_gamma"):
+            value = getattr(self, name)
+            _require(0 < value <= 1, name, "in (0, 1]", value)
+        for name in ("gae_lambda", "cost_gae_lambda"):
+            value = getattr(self, name)
+            _require(0 <= value <= 1, name, "in [0, 1]", value)
+        _require_positive(
+            self,
+            "policy_lr",
+            "value_lr",
+            "clip_eps",
+            "target_kl",
+            "kl_stop_factor",
+            "multiplier_init",
+            "multiplier_lr",
+            "cg_damping",
+        )
+        ratio = self.backtrack_ratio
+        _require(0 < ratio < 1, "backtrack_ratio", "in (0, 1)", ratio)
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How every slot is trained: worlds, epochs and the learner's settings.
+
+    An epoch of a slot is `num_worlds` x `env.num_steps` steps. With
+    `segments_per_episode` = k > 1 the slot has k cohorts of `num_worlds` worlds and
+    an epoch is `env.num_steps` / k steps long; k = 1 is the paper.
+    `chunk_epochs` epochs run in one jitted call.
+    """
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    num_worlds: int = 30
+    segments_per_episode: int = 1
+    num_epochs: int = 333
+    chunk_epochs: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("num_worlds", "segments_per_episode", "num_epochs"):
+            _require(getattr(self, name) >= 1, name, ">= 1", getattr(self, name))
+        k, steps = self.segments_per_episode, self.env.num_steps
+        _require(
+            steps % k == 0, "segments_per_episode", f"a divisor of num_steps={steps}", k
+        )
+        rows = self.num_worlds * steps  # k cohorts x 1/k of an episode
+        for name in ("policy_minibatches", "value_minibatches"):
+            count = getattr(self.agent, name)
+            _require(
+                rows % count == 0,
+                name,
+                f"a divisor of num_worlds x num_steps = {rows}",
+                count,
+            )
+        chunk = self.chunk_epochs
+        _require(
+            chunk >= 1 and self.num_epochs % chunk == 0,
+            "chunk_epochs",
+            f"a divisor of num_epochs={self.num_epochs}",
+            chunk,
+        )
+
+    @property
+    def epoch_steps(self) -> int:
+        """Steps of each world in an epoch, T."""
+        return self.env.num_steps // self.segments_per_episode
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """The evolutionary search; the defaults are the paper's, or ours where it is silent.
+
+    Ours: `init_std` 1 (the paper: "randomly sample"), 7 stages, each child mutated
+    additively or multiplicatively with probability 1/2, factors element-wise uniform
+    in [`mutation_low`, `mutation_high`], elites kept and retrained with new seeds,
+    "converged" = the mean over the last `fitness_epochs` epochs, "zero violation" =
+    a summed extrinsic cost <= `zero_tolerance` over those episodes.
+    `selection="random"` replaces the ranking by a random choice: the control.
+    """
+
+    train: TrainConfig = field(default_factory=TrainConfig)
+    seed: int = 0
+    algorithms: tuple[Algorithm, ...] = ("ppo_lagrangian", "cpo")
+    cost_limit: float = 0.0
+    population_size: int = 50
+    num_elites: int = 5
+    num_stages: int = 7
+    fitness_epochs: int = 10
+    init_std: float = 1.0
+    mutation_std: float = 1.0
+    mutation_low: float = 0.5
+    mutation_high: float = 2.0
+    zero_tolerance: float = 0.0
+    selection: Selection = "paper"
+
+    def __post_init__(self) -> None:
+        size = self.population_size
+        _require(size >= 1, "population_size", ">= 1", size)
+        _require(
+            1 <= self.num_elites <= size,
+            "num_elites",
+            f"in [1, population_size={size}]",
+            self.num_elites,
+        )
+        _require(self.num_stages >= 1, "num_stages", ">= 1", self.num_stages)
+        _require(
+            1 <= self.fitness_epochs <= max(1, self.train.num_epochs // 3),
+            "fitness_epochs",
+            f"in [1, num_epochs={self.train.num_epochs} // 3]",
+            self.fitness_epochs,
+        )
+        known = ("ppo_lagrangian", "cpo")
+        _require(
+            len(self.algorithms) > 0
+            and len(set(self.algorithms)) == len(self.algorithms)
+            and all(name in known for name in self.algorithms),
+            "algorithms",
+            f"distinct names out of {', '.join(known)}",
+            self.algorithms,
+        )
+        _require_positive(self, "init_std", "mutation_std", "mutation_low")
+        low, high = self.mutation_low, self.mutation_high
+        _require(high >= low, "mutation_high", f">= mutation_low={low}", high)
+        tolerance = self.zero_tolerance
+        _require(tolerance >= 0, "zero_tolerance", ">= 0", tolerance)
+        selections = ("paper", "random")
+        _require(
+            self.selection in selections,
+            "selection",
+            f"one of {', '.join(selections)}",
+            self.selection,
+        )
+        _require(0 <= self.seed < 2**32, "seed", "in [0, 2**32)", self.seed)
+        _require(math.isfinite(self.cost_limit), "cost_limit", "finite", self.cost_limit)
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps of the whole search."""
+        train = self.train
+        slots = self.population_size * len(self.algorithms)
+        epoch = train.num_worlds * train.env.num_steps
+        return self.num_stages * train.num_epochs * slots * epoch
+
+
+_LAPTOP_AGENT = AgentConfig(
+    hidden_sizes=(64, 64),
+    policy_passes=6,
+    policy_minibatches=8,
+    value_passes=6,
+    value_minibatches=8,
+)
+
+PRESETS: dict[str, SearchConfig] = {
+    "laptop": SearchConfig(
+        train=TrainConfig(
+            agent=_LAPTOP_AGENT, num_worlds=8, num_epochs=24, chunk_epochs=1
+        ),
+        population_size=8,
+        num_elites=2,
+        num_stages=3,
+        fitness_epochs=3,
+        init_std=5.0,
+    ),
+    "search": SearchConfig(
+        train=TrainConfig(
+            agent=_LAPTOP_AGENT, num_worlds=30, num_epochs=33, chunk_epochs=3
+        ),
+        num_stages=5,
+        init_std=5.0,
+    ),
+    "paper": SearchConfig(train=TrainConfig(chunk_epochs=3)),
+    "smoke": SearchConfig(
+        train=TrainConfig(
+            env=EnvConfig(num_steps=50),
+            agent=dataclasses.replace(
+                _LAPTOP_AGENT, hidden_sizes=(16, 16), policy_passes=2, value_passes=2,
+                policy_minibatches=2, value_minibatches=2,
+            ),
+            num_worlds=2,
+            num_epochs=2,
+        ),
+        population_size=4,
+        num_elites=1,
+        num_stages=2,
+        fitness_epochs=1,
+        init_std=5.0,
+    ),
+}
+
+
+def preset(name: str) -> SearchConfig:
+    """A named `SearchConfig`.
+
+    Raises:
+      ValueError: if there is no such preset; the message lists those that exist.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}; presets: {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,0 +1,156 @@
+"""The records that flow through the library, and the legend of their axes.
+
+Axes, used in every docstring of the package:
+
+    A  algorithms        P  slots (one agent each)   N  worlds of a slot
+    T  steps             O  observation              U  action
+    H  hazards           Q  pillars                  B  lidar bins (8)
+    D  parameters of the intrinsic cost (41)         K  terms of the cost bank
+
+Lengths are metres, angles radians, times seconds.
+"""
+
+from typing import Any
+
+import jax
+from flax import struct
+
+Key = jax.Array
+Metrics = dict[str, jax.Array]
+
+
+class Layout(struct.PyTreeNode):
+    """Where everything stands at the start of an episode, world frame.
+
+    Attributes:
+      robot_xy: [2] robot origin.
+      robot_yaw: [] heading of the robot, counter-clockwise from +x.
+      goal_xy: [2] centre of the goal.
+      hazards: [H, 2] hazard centres.
+      pillars: [Q, 2] pillar centres.
+      box_xy: [2] box centre; zeros where the task has no box.
+      box_yaw: [] heading of the box; zero where the task has no box.
+    """
+
+    robot_xy: jax.Array
+    robot_yaw: jax.Array
+    goal_xy: jax.Array
+    hazards: jax.Array
+    pillars: jax.Array
+    box_xy: jax.Array
+    box_yaw: jax.Array
+
+
+class CostInputs(struct.PyTreeNode):
+    """What a training cost may look at, all of the post-step state.
+
+    Attributes:
+      cost: [...] extrinsic cost of the step.
+      constraint_lidar: [..., B] the 8-bin lidar of the hazards or pillars, in [0, 1].
+      distance: [...] planar distance, robot origin to the closest constraint centre.
+      previous_distance: [...] the same one step earlier (at reset: `distance`).
+      radius: [...] radius of a constraint object.
+    """
+
+    cost: jax.Array
+    constraint_lidar: jax.Array
+    distance: jax.Array
+    previous_distance: jax.Array
+    radius: jax.Array
+
+
+class EnvState(struct.PyTreeNode):
+    """One world between two steps.
+
+    Attributes:
+      data: `mjx.Data`, the physics; `step` reads the physical state from here alone.
+      layout: where things stand now; `goal_xy` moves when a goal is met.
+      obs: [O] observation.
+      reward: [] reward of the last step.
+      cost: [] extrinsic cost of the last step.
+      done: [] bool, True exactly at the time limit.
+      failed: [] bool, True from the first non-finite number until the next reset.
+      age: [] int32 steps since the reset.
+      task_distances: [...] the task's distances that the next reward starts from.
+      cost_inputs: what a training cost may look at.
+      metrics: counters since the reset: `goals_met`, `goal_move_failures`,
+        `distance_travelled` (metres).
+      key: source of later goal moves.
+    """
+
+    data: Any
+    layout: Layout
+    obs: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    done: jax.Array
+    failed: jax.Array
+    age: jax.Array
+    task_distances: jax.Array
+    cost_inputs: CostInputs
+    metrics: Metrics
+    key: Key
+
+
+class Trajectory(struct.PyTreeNode):
+    """What one epoch of rollouts leaves behind.
+
+    Attributes:
+      obs: [T + 1, N, O] observations; the last row bootstraps the time limit.
+      action: [T, N, U] actions as sampled, unclipped.
+      reward: [T, N] rewards received after acting in obs[t].
+      cost_inputs: fields [T, N, ...], of the state after the action.
+      valid: [T, N] 1.0 where the row counts, 0.0 once its world has failed.
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    cost_inputs: CostInputs
+    valid: jax.Array
+
+
+class TrainingCost(struct.PyTreeNode):
+    """The cost a learner sees, as data, so that slots can differ in it.
+
+    Attributes:
+      weights: [K] weight of each term of the cost bank.
+      theta: [D] parameters of the intrinsic cost network.
+      limit: [] allowed cost of an episode (undiscounted sum).
+    """
+
+    weights: jax.Array
+    theta: jax.Array
+    limit: jax.Array
+
+
+class Slot(struct.PyTreeNode):
+    """One agent to train, as data.
+
+    Attributes:
+      cost: its training cost and limit.
+      key: root of all its random numbers.
+      constrained: [] float32; 0 turns PPO-Lagrangian into plain PPO.
+    """
+
+    cost: TrainingCost
+    key: Key
+    constrained: jax.Array
+
+
+class EvalResult(struct.PyTreeNode):
+    """Whole episodes of a fixed policy.
+
+    Attributes:
+      ep_return: [E] undiscounted return of each episode.
+      ep_cost: [E] extrinsic cost of each episode.
+      distance_travelled: [E] path length of each episode, metres.
+      valid: [E] 1.0 where no number of the episode was non-finite.
+      violation_rate: [] share of valid episodes with `ep_cost` > 0.
+    """
+
+    ep_return: jax.Array
+    ep_cost: jax.Array
+    distance_travelled: jax.Array
+    valid: jax.Array
+    violation_rate: jax.Array
