@@ -1,0 +1,1 @@
+"""AutoCost in JAX."""

@@ -1,0 +1,1 @@
+"""The learners: PPO, PPO-Lagrangian and CPO."""
