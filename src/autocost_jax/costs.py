@@ -1,0 +1,206 @@
+"""Training costs as data: a bank of cost terms and the intrinsic cost network.
+
+    total = sum_k where(w_k != 0, w_k * term_k, 0)
+
+A `TrainingCost` holds the weights, the network's parameters and the limit, so slots
+with different costs differ in data only and share one program. A user adds a term by
+passing a longer bank.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from autocost_jax.config import LIDAR_BINS, THETA_SIZE
+from autocost_jax.records import CostInputs, TrainingCost
+
+HIDDEN = 4  # the paper's hidden layer: 8 * 4 + 4 + 4 + 1 = 41 parameters
+
+
+class CostTerm(NamedTuple):
+    """A named term of a training cost.
+
+    Attributes:
+      name: how a method refers to it.
+      fn: (CostInputs with fields [...], theta [D]) -> cost [...].
+    """
+
+    name: str
+    fn: Callable[[CostInputs, jax.Array], jax.Array]
+
+
+def intrinsic_cost(theta: jax.Array, lidar: jax.Array) -> jax.Array:
+    """The evolved cost: sigmoid(W2 sigmoid(W1 lidar + b1) + b2), in (0, 1).
+
+    Args:
+      theta: [41] parameters: W1 [8, 4] row-major, b1 [4], W2 [4], b2.
+      lidar: [..., 8] the constraint lidar of the post-step state.
+
+    Returns:
+      [...] cost of the step.
+
+    Source: He, Zhao & Liu 2023, section "Experiment Setting"; the sigmoid of the
+    hidden layer and the parameter layout are ours.
+    """
+    split = LIDAR_BINS * HIDDEN
+    w1 = theta[:split].reshape(LIDAR_BINS, HIDDEN)
+    b1, w2, b2 = theta[split : split + HIDDEN], theta[split + HIDDEN : -1], theta[-1]
+    # Bins first: eight multiply-adds fuse where a [.., 8] x [8, 4] matmul would not.
+    pre = b1 + sum(lidar[..., i, None] * w1[i] for i in range(LIDAR_BINS))
+    return jax.nn.sigmoid(jnp.sum(jax.nn.sigmoid(pre) * w2, axis=-1) + b2)
+
+
+def _extrinsic(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+    del theta
+    return inputs.cost
+
+
+def _intrinsic(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+    return intrinsic_cost(theta, inputs.constraint_lidar)
+
+
+def _distance_decrease(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+    del theta
+    return jnp.maximum(inputs.previous_distance - inputs.distance, 0.0)
+
+
+def _distance_change(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+    del theta
+    return inputs.previous_distance - inputs.distance
+
+
+def _distance_change_indicator(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+    del theta
+    closer = inputs.previous_distance - inputs.distance >= 0
+    return closer.astype(inputs.distance.dtype)
+
+
+def safety_margin(multiple: float) -> CostTerm:
+    """The hand-made cost max(0, multiple * radius - distance), metres.
+
+    Source: He, Zhao & Liu 2023, "The Necessity of AutoCost"; its exact form is not
+    published, this one is ours.
+    """
+
+    def fn(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+        del theta
+        return jnp.maximum(multiple * inputs.radius - inputs.distance, 0.0)
+
+    return CostTerm(f"safety_margin_{multiple:g}x", fn)
+
+
+BANK: tuple[CostTerm, ...] = (
+    CostTerm("extrinsic", _extrinsic),
+    CostTerm("intrinsic", _intrinsic),
+    CostTerm("distance_decrease", _distance_decrease),
+    CostTerm("distance_change", _distance_change),
+    CostTerm("distance_change_indicator", _distance_change_indicator),
+    safety_margin(1.0),
+    safety_margin(2.0),
+    safety_margin(3.0),
+)
+
+
+def total_cost(
+    cost: TrainingCost, inputs: CostInputs, bank: Sequence[CostTerm] = BANK
+) -> jax.Array:
+    """The cost a learner sees; a term of weight 0 cannot poison it.
+
+    Args:
+      cost: weights [K] over `bank`, theta [D].
+      inputs: fields [...].
+      bank: the cost terms, static.
+
+    Returns:
+      [...] total cost of each step.
+    """
+    if cost.weights.shape[-1] != len(bank):
+        raise ValueError(
+            f"weights must have one entry for each of the {len(bank)} terms of the "
+            f"bank, got {cost.weights.shape[-1]}"
+        )
+    total = jnp.zeros_like(inputs.cost)
+    for weight, term in zip(cost.weights, bank, strict=True):
+        total += jnp.where(weight != 0, weight * term.fn(inputs, cost.theta), 0.0)
+    return total
+
+
+def training_cost(
+    method: str,
+    theta: jax.Array | np.ndarray | None = None,
+    limit: float = 0.0,
+    bank: Sequence[CostTerm] = BANK,
+) -> TrainingCost:
+    """A `TrainingCost` from a method such as "extrinsic+0.1*safety_margin_2x".
+
+    Args:
+      method: terms of the bank joined by "+", each with an optional "weight*".
+      theta: [D] parameters of the intrinsic network; required if the method uses it.
+      limit: allowed cost of an episode.
+      bank: the cost terms that `method` may name.
+
+    Raises:
+      ValueError: unknown term (the message lists the bank), bad weight, or no theta
+        although the method uses the network.
+    """
+    names = [term.name for term in bank]
+    weights = np.zeros(len(bank), np.float32)
+    for part in method.split("+"):
+        factor, _, name = part.strip().rpartition("*")
+        if name.strip() not in names:
+            raise ValueError(
+                f"unknown cost term {name.strip()!r} in method {method!r}; "
+                f"terms: {', '.join(names)}"
+            )
+        try:
+            weight = float(factor) if factor else 1.0
+        except ValueError:
+            raise ValueError(
+                f"weight {factor!r} in method {method!r} must be a number"
+            ) from None
+        weights[names.index(name.strip())] += weight
+    if theta is None:
+        uses_network = "intrinsic" in names and weights[names.index("intrinsic")] != 0
+        if uses_network:
+            raise ValueError(f"method {method!r} needs the parameters of a cost (theta)")
+        theta = np.zeros(THETA_SIZE, np.float32)
+    return TrainingCost(
+        weights=jnp.asarray(weights),
+        theta=jnp.asarray(theta, jnp.float32),
+        limit=jnp.asarray(limit, jnp.float32),
+    )
+
+
+def save_cost(
+    path: str | Path, theta: jax.Array | np.ndarray, card: Mapping[str, Any]
+) -> None:
+    """Write `<path>.npz` (theta [41], float32) and `<path>.json` (its card)."""
+    path = Path(path).with_suffix("")
+    np.savez(path.with_suffix(".npz"), theta=np.asarray(theta, np.float32))
+    text = json.dumps(dict(card), indent=2, allow_nan=False)
+    path.with_suffix(".json").write_text(text + "\n")
+
+
+def load_cost(path: str | Path) -> jax.Array:
+    """The parameters theta [41] of a saved cost.
+
+    Raises:
+      ValueError: if the file is missing or is not a cost: one line naming it.
+    """
+    file = Path(path).with_suffix(".npz")
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            theta = archive["theta"]
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{file} is not a readable cost file: {error}") from None
+    if theta.shape != (THETA_SIZE,) or not np.isfinite(theta).all():
+        raise ValueError(
+            f"{file} must hold theta with {THETA_SIZE} finite numbers, "
+            f"got shape {theta.shape}"
+        )
+    return jnp.asarray(theta, jnp.float32)

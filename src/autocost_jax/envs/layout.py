@@ -1,0 +1,218 @@
+"""Random layouts and goal moves: rejection sampling without a loop that waits.
+
+Every draw of Safety Gym's sampler is replaced by `NUM_CANDIDATES` draws made at once,
+of which the first valid one is taken: the same distribution, a fixed shape. One
+placement rule serves the resets and goal moves on the device and the check of a
+configuration on the host, which runs it with NumPy.
+"""
+
+import functools
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from autocost_jax.config import EnvConfig
+from autocost_jax.records import Key, Layout
+
+NUM_CANDIDATES = 128  # draws for one object; Safety Gym makes up to 100
+NUM_RESTARTS = 4  # whole layouts tried side by side; one fails 0.3-0.8 % of the time
+HOST_LAYOUTS = 256
+MAX_HOST_FAILURES = 0.05
+ROBOT, GOAL, HAZARDS = 0, 1, 2  # first row of each kind of object
+
+
+class Arena(NamedTuple):
+    """Where objects may stand, in placement order: robot, goal, hazards.
+
+    Attributes:
+      keepout: [M] radius each object keeps free around itself.
+      low: [M, 2] lower corner of the extents shrunk by the object's own keepout.
+      size: [M, 2] width and height of the shrunk extents.
+      margin: extra gap between two keepouts.
+    """
+
+    keepout: np.ndarray
+    low: np.ndarray
+    size: np.ndarray
+    margin: float
+
+
+def make_arena(config: EnvConfig) -> Arena:
+    """The placement rule of a configuration.
+
+    Raises:
+      ValueError: if more than 5 % of 256 trial layouts cannot be placed.
+    """
+    hazards = [config.hazards_keepout] * config.hazards_num
+    keepout = np.array([config.robot_keepout, config.goal_keepout, *hazards])
+    corners = np.asarray(config.placements_extents)
+    low = corners[None, :2] + keepout[:, None]
+    size = corners[None, 2:] - keepout[:, None] - low
+    arena = Arena(keepout, low, size, config.placements_margin)
+    share = host_failure_share(arena)
+    if share > MAX_HOST_FAILURES:
+        raise ValueError(
+            f"the objects of {config.name} do not fit: {share:.0%} of {HOST_LAYOUTS} "
+            f"trial layouts failed, at most {MAX_HOST_FAILURES:.0%} may; enlarge "
+            "placements_extents or lower hazards_num, hazards_keepout, goal_keepout "
+            "or robot_keepout"
+        )
+    return arena
+
+
+def place_one(
+    xp: ModuleType, placed: Any, keepout: Any, draws: Any, low: Any, size: Any, gap: Any
+) -> tuple[Any, Any]:
+    """The first of K candidates that keeps clear of everything placed so far.
+
+        clearance_k = min over m of |candidate_k - placed_m| - (keepout_m + gap)
+
+    Args:
+      xp: `numpy` or `jax.numpy`.
+      placed: [..., M, 2] positions; +inf where nothing stands yet, metres.
+      keepout: [M] keepouts of the placed objects.
+      draws: [..., K, 2] uniform in [0, 1).
+      low: [2] lower corner of the candidates' rectangle.
+      size: [2] width and height of that rectangle.
+      gap: [] own keepout plus margin.
+
+    Returns:
+      position [..., 2] and whether it is valid [...]; where no candidate is, the one
+      with the largest clearance.
+
+    Source: openai/safety-gym engine.py, sample_layout and placement_is_valid.
+    Differs: all candidates at once.
+    """
+    candidates = low + draws * size
+    # One coordinate at a time: no [K, M, 2] array, which is slow on every backend.
+    dx = candidates[..., :, None, 0] - placed[..., None, :, 0]
+    dy = candidates[..., :, None, 1] - placed[..., None, :, 1]
+    clearance = (xp.sqrt(dx * dx + dy * dy) - (keepout + gap)).min(-1)
+    valid = clearance >= 0
+    best = xp.where(
+        valid.any(-1), xp.argmax(valid, axis=-1), xp.argmax(clearance, axis=-1)
+    )
+    position = xp.take_along_axis(candidates, best[..., None, None], axis=-2)
+    return position[..., 0, :], valid.any(-1)
+
+
+def place_on_host(arena: Arena, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One placement attempt for many layouts, with NumPy.
+
+    Args:
+      arena: the placement rule.
+      draws: [L, M + 1, K, 2] uniform in [0, 1); the last row redraws the goal.
+
+    Returns:
+      positions [L, M, 2] and success [L].
+    """
+    placed = np.full((len(draws), len(arena.keepout), 2), np.inf)
+    success = np.ones(len(draws), bool)
+    for row, index in enumerate([*range(len(arena.keepout)), GOAL]):
+        placed[:, index] = np.inf  # the second goal draw forgets the first goal
+        gap = arena.keepout[index] + arena.margin
+        place = functools.partial(place_one, np, placed, arena.keepout)
+        xy, valid = place(draws[:, row], arena.low[index], arena.size[index], gap)
+        placed[:, index] = xy
+        success &= valid
+    return placed, success
+
+
+def host_failure_share(arena: Arena) -> float:
+    """Share of `HOST_LAYOUTS` layouts that fail in all `NUM_RESTARTS` attempts."""
+    rng = np.random.default_rng(0)
+    open_layouts = HOST_LAYOUTS
+    for _ in range(NUM_RESTARTS):
+        shape = (open_layouts, len(arena.keepout) + 1, NUM_CANDIDATES, 2)
+        _, success = place_on_host(arena, rng.random(shape))
+        open_layouts -= int(success.sum())
+    return open_layouts / HOST_LAYOUTS
+
+
+def place_all(arena: Arena, draws: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """One placement attempt: every object in turn, then the goal once more.
+
+    Args:
+      arena: the placement rule.
+      draws: [M + 1, K, 2] uniform in [0, 1); the last row redraws the goal.
+
+    Returns:
+      positions [M, 2] and whether all of them are valid [].
+
+    Source: openai/safety-gym engine.py, sample_layout, build_goal_position.
+    """
+    dtype = draws.dtype
+    keepout = jnp.asarray(arena.keepout, dtype)
+    low, size = jnp.asarray(arena.low, dtype), jnp.asarray(arena.size, dtype)
+
+    def place_next(carry, inputs):
+        placed, success = carry
+        index, draw = inputs
+        placed = placed.at[index].set(jnp.inf)
+        gap = keepout[index] + arena.margin
+        xy, valid = place_one(jnp, placed, keepout, draw, low[index], size[index], gap)
+        return (placed.at[index].set(xy), success & valid), None
+
+    order = jnp.append(jnp.arange(len(arena.keepout)), GOAL)
+    empty = jnp.full((len(arena.keepout), 2), jnp.inf, dtype)
+    (placed, success), _ = jax.lax.scan(
+        place_next, (empty, jnp.array(True)), (order, draws)
+    )
+    return placed, success
+
+
+def sample_layout(arena: Arena, key: Key, dtype: Any) -> tuple[Layout, jax.Array]:
+    """A fresh random layout.
+
+    Args:
+      arena: the placement rule.
+      key: consumed.
+      dtype: floating type of the layout.
+
+    Returns:
+      the layout, and `failed` []: True if every one of four attempts failed (the
+      layout then breaks a keepout).
+    """
+    key_draws, key_yaw = jax.random.split(key)
+    shape = (NUM_RESTARTS, len(arena.keepout) + 1, NUM_CANDIDATES, 2)
+    draws = jax.random.uniform(key_draws, shape, dtype)
+    placed, success = jax.vmap(functools.partial(place_all, arena))(draws)
+    xy = placed[jnp.argmax(success)]
+    layout = Layout(
+        robot_xy=xy[ROBOT],
+        robot_yaw=jax.random.uniform(key_yaw, (), dtype, 0.0, 2 * np.pi),
+        goal_xy=xy[GOAL],
+        hazards=xy[HAZARDS:],
+        pillars=jnp.zeros((0, 2), dtype),
+        box_xy=jnp.zeros(2, dtype),
+        box_yaw=jnp.zeros((), dtype),
+    )
+    return layout, ~success.any()
+
+
+def move_goal(arena: Arena, layout: Layout, key: Key) -> tuple[jax.Array, jax.Array]:
+    """A new goal position, clear of the robot and of everything else.
+
+    Args:
+      arena: the placement rule.
+      layout: where things stand now; its goal is ignored.
+      key: consumed.
+
+    Returns:
+      position [2] and whether it is valid []; if no candidate was, the position is
+      the candidate with the largest clearance.
+
+    Source: openai/safety-gym engine.py, sample_goal_position.
+    Differs: 128 candidates at once instead of up to 10000 in turn, and the best one
+    instead of the end of the episode.
+    """
+    dtype = layout.goal_xy.dtype
+    others = jnp.concatenate([layout.robot_xy[None], layout.hazards])
+    keepout = jnp.asarray(np.delete(arena.keepout, GOAL), dtype)
+    draws = jax.random.uniform(key, (NUM_CANDIDATES, 2), dtype)
+    low, size = (jnp.asarray(part[GOAL], dtype) for part in (arena.low, arena.size))
+    gap = jnp.asarray(arena.keepout[GOAL] + arena.margin, dtype)
+    return place_one(jnp, others, keepout, draws, low, size, gap)

@@ -1,0 +1,228 @@
+"""The evolutionary search as pure functions over stacked pytrees.
+
+A candidate is any pytree; a population stacks them on a leading axis P. The search
+knows nothing of how the fitness, a pair (cost, return), was obtained.
+
+Source: He, Zhao & Liu 2023, "AutoCost". Ours where the paper is silent: see
+`SearchConfig`; ties fall to the earlier candidate, children are dealt round-robin to
+the elites in rank order, and elites are kept in front of the children.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from autocost_jax.config import THETA_SIZE, SearchConfig
+from autocost_jax.records import Key
+
+
+class Fitness(struct.PyTreeNode):
+    """How good the candidates were; lower cost first, then higher return.
+
+    Attributes:
+      cost: [P] mean extrinsic cost of an episode; +inf for a broken candidate.
+      ep_return: [P] mean return of an episode; -inf for a broken candidate.
+    """
+
+    cost: jax.Array
+    ep_return: jax.Array
+
+
+class ESState(struct.PyTreeNode):
+    """What the search remembers between stages.
+
+    Attributes:
+      generation: [] int32, stages told so far, G.
+      elites: stacked pytree [E, ...], the parents of the next candidates.
+      archive: stacked pytree [G_max * P, ...], every candidate told so far.
+      archive_fitness: its fitness; +inf, -inf where nothing was told yet.
+    """
+
+    generation: jax.Array
+    elites: Any
+    archive: Any
+    archive_fitness: Fitness
+
+
+class Best(struct.PyTreeNode):
+    """The final pick of a search.
+
+    Attributes:
+      candidate: pytree of the best candidate.
+      cost: [] its cost.
+      ep_return: [] its return.
+      zero_violation: [] bool; False: no candidate reached zero and this one has the
+        lowest cost.
+      generation: [] int32 stage in which it was told.
+      index: [] int32 its place in that stage.
+    """
+
+    candidate: Any
+    cost: jax.Array
+    ep_return: jax.Array
+    zero_violation: jax.Array
+    generation: jax.Array
+    index: jax.Array
+
+
+class ES(NamedTuple):
+    """init() -> state; ask(key, state) -> candidates; tell(key, state, ...) -> state."""
+
+    init: Callable[[], ESState]
+    ask: Callable[[Key, ESState], Any]
+    tell: Callable[[Key, ESState, Any, Fitness], ESState]
+
+
+def rank(fitness: Fitness, zero_tolerance: float = 0.0) -> jax.Array:
+    """Indices [P], best first: cost (<= tolerance counts as 0), then return.
+
+    One lexicographic sort covers both branches of the paper's rule: with more
+    zero-violation candidates than elites the highest returns win, otherwise the lowest
+    costs. Anything non-finite comes last.
+    """
+    ok = jnp.isfinite(fitness.cost) & jnp.isfinite(fitness.ep_return)
+    cost = jnp.where(fitness.cost <= zero_tolerance, 0.0, fitness.cost)
+    cost = jnp.where(ok, cost, jnp.inf)
+    loss = jnp.where(ok, -fitness.ep_return, jnp.inf)
+    return jnp.lexsort((loss, cost))
+
+
+def select(
+    candidates: Any, fitness: Fitness, num_elites: int, zero_tolerance: float = 0.0
+) -> tuple[Any, jax.Array]:
+    """The best candidates and their indices, in rank order.
+
+    Args:
+      candidates: stacked pytree [P, ...].
+      fitness: fields [P].
+      num_elites: E.
+      zero_tolerance: cost up to which a candidate counts as free of violations.
+
+    Returns:
+      Elites, stacked [E, ...], and their indices [E].
+
+    Raises:
+      ValueError: if num_elites is not in [1, P].
+    """
+    size = fitness.cost.shape[0]
+    if not 1 <= num_elites <= size:
+        raise ValueError(f"num_elites must be in [1, {size}], got {num_elites}")
+    index = rank(fitness, zero_tolerance)[:num_elites]
+    return jax.tree.map(lambda x: x[index], candidates), index
+
+
+def mutate(
+    key: Key,
+    elites: Any,
+    num_children: int,
+    std: float = 1.0,
+    low: float = 0.5,
+    high: float = 2.0,
+) -> Any:
+    """Children of the elites, dealt round-robin, each by one of two mutations.
+
+    theta + z with z ~ N(0, std^2), or theta * z with z ~ U[low, high], element-wise;
+    which one is a fair coin for each child.
+
+    Args:
+      key: consumed.
+      elites: stacked pytree [E, ...].
+      num_children: C.
+      std: deviation of the additive mutation.
+      low: smallest factor of the multiplicative mutation.
+      high: largest factor.
+
+    Returns:
+      Stacked pytree [C, ...].
+    """
+    leaves, treedef = jax.tree.flatten(elites)
+    key_kind, *keys = jax.random.split(key, 1 + len(leaves))
+    is_additive = jax.random.bernoulli(key_kind, 0.5, (num_children,))
+    children = []
+    for leaf, leaf_key in zip(leaves, keys, strict=True):
+        parent = leaf[jnp.arange(num_children) % leaf.shape[0]]
+        key_add, key_scale = jax.random.split(leaf_key)
+        noise = std * jax.random.normal(key_add, parent.shape, parent.dtype)
+        factor = jax.random.uniform(key_scale, parent.shape, parent.dtype, low, high)
+        additive = is_additive.reshape(-1, *[1] * (parent.ndim - 1))
+        children.append(jnp.where(additive, parent + noise, parent * factor))
+    return treedef.unflatten(children)
+
+
+def truncation_es(config: SearchConfig) -> ES:
+    """The paper's search over theta [41]: keep the best, mutate, repeat.
+
+    `config.selection` "random" replaces the ranking by a random choice of elites, the
+    control that shows what selection adds.
+    """
+    size, elites = config.population_size, config.num_elites
+    capacity = config.num_stages * size
+
+    def init() -> ESState:
+        return ESState(
+            generation=jnp.zeros((), jnp.int32),
+            elites=jnp.zeros((elites, THETA_SIZE), jnp.float32),
+            archive=jnp.zeros((capacity, THETA_SIZE), jnp.float32),
+            archive_fitness=Fitness(
+                cost=jnp.full(capacity, jnp.inf, jnp.float32),
+                ep_return=jnp.full(capacity, -jnp.inf, jnp.float32),
+            ),
+        )
+
+    def ask(key: Key, state: ESState) -> jax.Array:
+        key_init, key_mutate = jax.random.split(key)
+        shape = (size, THETA_SIZE)
+        first = config.init_std * jax.random.normal(key_init, shape, jnp.float32)
+        children = mutate(
+            key_mutate,
+            state.elites,
+            size - elites,
+            config.mutation_std,
+            config.mutation_low,
+            config.mutation_high,
+        )
+        later = jnp.concatenate([state.elites, children])
+        return jnp.where(state.generation == 0, first, later)
+
+    def tell(key: Key, state: ESState, candidates: jax.Array, fitness: Fitness):
+        if config.selection == "paper":
+            parents, _ = select(candidates, fitness, elites, config.zero_tolerance)
+        else:
+            parents = candidates[jax.random.permutation(key, size)[:elites]]
+        start = state.generation * size
+        return ESState(
+            generation=state.generation + 1,
+            elites=parents,
+            archive=jax.lax.dynamic_update_slice_in_dim(
+                state.archive, candidates, start, 0
+            ),
+            archive_fitness=jax.tree.map(
+                lambda all_, new: jax.lax.dynamic_update_slice_in_dim(
+                    all_, new.astype(all_.dtype), start, 0
+                ),
+                state.archive_fitness,
+                fitness,
+            ),
+        )
+
+    return ES(init, ask, tell)
+
+
+def best(state: ESState, population_size: int, zero_tolerance: float = 0.0) -> Best:
+    """The final pick: of all zero-violation candidates of the search the highest return.
+
+    Without any, the candidate of lowest cost; `zero_violation` says which it is.
+    """
+    fitness = state.archive_fitness
+    index = rank(fitness, zero_tolerance)[0]
+    return Best(
+        candidate=jax.tree.map(lambda x: x[index], state.archive),
+        cost=fitness.cost[index],
+        ep_return=fitness.ep_return[index],
+        zero_violation=fitness.cost[index] <= zero_tolerance,
+        generation=(index // population_size).astype(jnp.int32),
+        index=(index % population_size).astype(jnp.int32),
+    )

@@ -1,0 +1,326 @@
+"""The AutoCost search: ask -> train every candidate -> fitness -> tell, stage by stage.
+
+Two ways to run one and the same search: `evolve`, a host loop over jitted chunks that
+can be watched, checkpointed and resumed, and `search`, a pure function of a key. Both
+are made of the same pieces.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from autocost_jax import es as es_lib
+from autocost_jax.config import SearchConfig
+from autocost_jax.costs import BANK, CostTerm, training_cost
+from autocost_jax.envs.env import make_env
+from autocost_jax.es import ES, ESState, Fitness, truncation_es
+from autocost_jax.population import (
+    Population,
+    candidate_slots,
+    jit_bundle,
+    make_agents,
+    make_population,
+)
+from autocost_jax.records import Key, Metrics, Slot
+from autocost_jax.train import Learner, init_learner, run_stage
+
+# What the fitness and the report are made of, kept for every epoch of a stage.
+TRACKED = (
+    "ep_cost",
+    "ep_return",
+    "distance_travelled",
+    "intrinsic_far",
+    "intrinsic_near",
+)
+# Purposes of a stage's keys: every key is fold_in(root, stage, purpose).
+ASK, TELL, SLOTS = range(3)
+
+
+class SearchState(struct.PyTreeNode):
+    """Everything a search needs to go on; a checkpoint holds exactly this.
+
+    Attributes:
+      es: the evolutionary strategy's state.
+      candidates: [P, D] the candidates in training.
+      learners: for each algorithm, stacked [P, ...].
+      stage: [] int32; `num_stages` once the search is over.
+      epoch: [] int32, epochs of this stage already done.
+      history: `TRACKED` metrics of this stage, each [num_epochs, A, P].
+    """
+
+    es: ESState
+    candidates: jax.Array
+    learners: tuple[Learner, ...]
+    stage: jax.Array
+    epoch: jax.Array
+    history: Metrics
+
+
+class StageResult(struct.PyTreeNode):
+    """What a finished stage leaves.
+
+    Attributes:
+      candidates: [P, D].
+      fitness: the pair (cost, return), fields [P].
+      scores: `TRACKED` metrics averaged over the fitness epochs, each [A, P].
+      order: [P] candidate indices, best first, by the paper's rule.
+      frozen: [A, P] bool, agents that met a non-finite number.
+      learners: the trained agents, for each algorithm stacked [P, ...].
+    """
+
+    candidates: jax.Array
+    fitness: Fitness
+    scores: Metrics
+    order: jax.Array
+    frozen: jax.Array
+    learners: tuple[Learner, ...]
+
+
+class Progress(NamedTuple):
+    """What one chunk of `evolve` reports.
+
+    Attributes:
+      stage: stage of these epochs.
+      epoch: first epoch of the chunk.
+      metrics: for each algorithm, NumPy arrays [K, P].
+      result: the stage's result if this chunk ended it, else None.
+    """
+
+    stage: int
+    epoch: int
+    metrics: tuple[dict[str, np.ndarray], ...]
+    result: StageResult | None
+
+
+class SearchResult(struct.PyTreeNode):
+    """The outcome of the pure `search`.
+
+    Attributes:
+      es: the final state of the strategy; `es.best` picks from its archive.
+      fitness: fields [S, P], S stages.
+      scores: `TRACKED` metrics of each stage, each [S, A, P].
+    """
+
+    es: ESState
+    fitness: Fitness
+    scores: Metrics
+
+
+class Searcher(NamedTuple):
+    """The jitted pieces of a search on given devices.
+
+    Attributes:
+      config: the search.
+      root: its root key.
+      population: the population program.
+      es: the evolutionary strategy, jitted.
+    """
+
+    config: SearchConfig
+    root: Key
+    population: Population
+    es: ES
+
+
+def stage_key(root: Key, stage: jax.Array | int, purpose: int) -> Key:
+    """The key of one stage for one purpose."""
+    return jax.random.fold_in(jax.random.fold_in(root, stage), purpose)
+
+
+def stage_slots(
+    config: SearchConfig,
+    root: Key,
+    stage: jax.Array | int,
+    candidates: jax.Array,
+    bank: Sequence[CostTerm] = BANK,
+) -> tuple[Slot, ...]:
+    """For each algorithm the slots [P] that train c_ex + c_in of each candidate."""
+    cost = training_cost("extrinsic+intrinsic", candidates[0], config.cost_limit, bank)
+    size = candidates.shape[0]
+    stacked = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), cost)
+    stacked = stacked.replace(theta=candidates)
+    key = stage_key(root, stage, SLOTS)
+    return tuple(
+        candidate_slots(stacked, jax.random.fold_in(key, index))
+        for index in range(len(config.algorithms))
+    )
+
+
+def stage_result(
+    config: SearchConfig,
+    candidates: jax.Array,
+    history: Metrics,
+    learners: tuple[Learner, ...],
+) -> StageResult:
+    """Fitness and scores of a finished stage; a frozen agent costs +inf.
+
+    Args:
+      config: the search.
+      candidates: [P, D].
+      history: `TRACKED` metrics [num_epochs, A, P].
+      learners: trained, for each algorithm [P, ...].
+    """
+    last = {
+        name: jnp.mean(value[-config.fitness_epochs :], axis=0)
+        for name, value in history.items()
+    }
+    frozen = jnp.stack([group.frozen for group in learners])
+    broken = jnp.any(frozen, axis=0)
+    fitness = Fitness(
+        cost=jnp.where(broken, jnp.inf, jnp.mean(last["ep_cost"], axis=0)),
+        ep_return=jnp.where(broken, -jnp.inf, jnp.mean(last["ep_return"], axis=0)),
+    )
+    return StageResult(
+        candidates=candidates,
+        fitness=fitness,
+        scores=last,
+        order=es_lib.rank(fitness, config.zero_tolerance),
+        frozen=frozen,
+        learners=learners,
+    )
+
+
+def search(
+    config: SearchConfig, bank: Sequence[CostTerm] = BANK
+) -> Callable[[Key], SearchResult]:
+    """The whole search as one pure function of its root key; jit or vmap it."""
+    env = make_env(config.train.env)
+    agents = make_agents(config.algorithms, config.train, env)
+    strategy = truncation_es(config)
+
+    def run(root: Key) -> SearchResult:
+        def body(state: ESState, stage: jax.Array):
+            candidates = strategy.ask(stage_key(root, stage, ASK), state)
+            slots = stage_slots(config, root, stage, candidates, bank)
+            learners = tuple(
+                jax.vmap(lambda slot, agent=agent: init_learner(agent, slot))(group)
+                for agent, group in zip(agents, slots, strict=True)
+            )
+            learners, metrics = run_stage(
+                env, agents, config.train, learners, slots, bank
+            )
+            history = {
+                name: jnp.stack([group[name] for group in metrics], 1)
+                for name in TRACKED
+            }
+            result = stage_result(config, candidates, history, learners)
+            key = stage_key(root, stage, TELL)
+            state = strategy.tell(key, state, candidates, result.fitness)
+            return state, (result.fitness, result.scores)
+
+        stages = jnp.arange(config.num_stages)
+        state, (fitness, scores) = jax.lax.scan(body, strategy.init(), stages)
+        return SearchResult(es=state, fitness=fitness, scores=scores)
+
+    return run
+
+
+def make_searcher(
+    config: SearchConfig,
+    devices: Sequence[jax.Device] | None = None,
+    bank: Sequence[CostTerm] = BANK,
+) -> Searcher:
+    """Build the program of a search; nothing is compiled yet."""
+    env = make_env(config.train.env)
+    agents = make_agents(config.algorithms, config.train, env)
+    return Searcher(
+        config=config,
+        root=jax.random.key(config.seed),
+        population=make_population(env, agents, config.train, bank, devices),
+        es=jit_bundle(truncation_es(config)),
+    )
+
+
+def init_search(searcher: Searcher) -> SearchState:
+    """The state before the first epoch of the first stage."""
+    return _begin_stage(searcher, searcher.es.init(), 0)
+
+
+def evolve(
+    config: SearchConfig,
+    *,
+    state: SearchState | None = None,
+    searcher: Searcher | None = None,
+) -> Iterator[tuple[SearchState, Progress]]:
+    """Run or continue a search, one chunk of epochs at a time.
+
+    Args:
+      config: the search.
+      state: where to continue; default: from the start. Its learners are consumed.
+      searcher: from `make_searcher(config, ...)`; default: one device.
+
+    Yields:
+      After each chunk the state, ready to be saved and continued from, and what
+      happened. A yielded state's learners are consumed by the next chunk.
+
+    Raises:
+      RuntimeError: if every candidate of a stage failed; the message names the stage.
+    """
+    searcher = make_searcher(config) if searcher is None else searcher
+    state = init_search(searcher) if state is None else state
+    while int(state.stage) < config.num_stages:
+        state, progress = _run_chunk(searcher, state)
+        if progress.result is not None:
+            failed = ~np.isfinite(np.asarray(progress.result.fitness.cost))
+            if failed.all():
+                raise RuntimeError(
+                    f"every candidate of stage {progress.stage} failed "
+                    "(non-finite numbers in all agents)"
+                )
+        yield state, progress
+
+
+def _begin_stage(searcher: Searcher, es_state: ESState, stage: int) -> SearchState:
+    config, root = searcher.config, searcher.root
+    candidates = searcher.es.ask(stage_key(root, stage, ASK), es_state)
+    slots = stage_slots(config, root, stage, candidates)
+    shape = (config.train.num_epochs, len(config.algorithms), config.population_size)
+    return SearchState(
+        es=es_state,
+        candidates=candidates,
+        learners=searcher.population.init(slots),
+        stage=jnp.asarray(stage, jnp.int32),
+        epoch=jnp.zeros((), jnp.int32),
+        history={name: jnp.zeros(shape, jnp.float32) for name in TRACKED},
+    )
+
+
+def _run_chunk(
+    searcher: Searcher, state: SearchState
+) -> tuple[SearchState, Progress]:
+    """One chunk; at a stage's end also `tell` and the beginning of the next stage."""
+    config, root = searcher.config, searcher.root
+    stage, epoch = int(state.stage), int(state.epoch)
+    slots = stage_slots(config, root, stage, state.candidates)
+    learners, metrics = searcher.population.chunk(state.learners, slots, epoch)
+    after = epoch + config.train.chunk_epochs
+    history = {
+        name: value.at[epoch:after].set(jnp.stack([m[name] for m in metrics], axis=1))
+        for name, value in state.history.items()
+    }
+    host_metrics = tuple(
+        {name: np.asarray(value) for name, value in group.items()} for group in metrics
+    )
+    state = state.replace(
+        learners=learners, history=history, epoch=jnp.asarray(after, jnp.int32)
+    )
+    if after < config.train.num_epochs:
+        return state, Progress(stage, epoch, host_metrics, None)
+    result = stage_result(config, state.candidates, history, learners)
+    key = stage_key(root, stage, TELL)
+    es_state = searcher.es.tell(key, state.es, state.candidates, result.fitness)
+    if stage + 1 < config.num_stages:
+        state = _begin_stage(searcher, es_state, stage + 1)
+    else:
+        over = jnp.asarray(config.num_stages, jnp.int32)
+        state = state.replace(es=es_state, stage=over)
+    return state, Progress(stage, epoch, host_metrics, result)
+
+
+def best_of(config: SearchConfig, state: ESState) -> Any:
+    """The search's final pick, `es.Best`."""
+    return es_lib.best(state, config.population_size, config.zero_tolerance)

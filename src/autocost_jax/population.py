@@ -1,0 +1,193 @@
+"""The population program: every slot of every algorithm in one jitted chunk.
+
+The chunk is K epochs of the whole population under `jax.shard_map`: each device holds
+its share of every group and trains it without talking to the others. Groups are padded
+with copies of their first slot to a multiple of the device count. One code path serves
+one device and many. All `jax.jit` calls of the library are in this module.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from autocost_jax.agents.base import Agent
+from autocost_jax.agents.cpo import cpo
+from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
+from autocost_jax.config import Algorithm, TrainConfig
+from autocost_jax.costs import BANK, CostTerm
+from autocost_jax.envs.env import Env
+from autocost_jax.records import Key, Metrics, Slot, TrainingCost
+from autocost_jax.train import Learner, init_learner, run_epoch
+
+AXIS = "slot"
+AGENTS: dict[str, Callable[..., Agent]] = {"ppo_lagrangian": ppo_lagrangian, "cpo": cpo}
+
+
+class Population(NamedTuple):
+    """The compiled face of a population.
+
+    Attributes:
+      init: slots -> learners; both one stacked pytree [P_g, ...] a group.
+      chunk: (learners, slots, epoch) -> (learners, metrics [K, P_g] a group); the
+        learners passed in are donated.
+      compile: (learners, slots) -> None, compiles `chunk` ahead of its first call.
+      num_devices: devices it runs on.
+    """
+
+    init: Callable[[tuple[Slot, ...]], tuple[Learner, ...]]
+    chunk: Callable[..., tuple[tuple[Learner, ...], tuple[Metrics, ...]]]
+    compile: Callable[[tuple[Learner, ...], tuple[Slot, ...]], Any]
+    num_devices: int
+
+
+def make_agents(
+    algorithms: Sequence[Algorithm], config: TrainConfig, env: Env
+) -> tuple[Agent, ...]:
+    """One Agent for each named algorithm."""
+    return tuple(AGENTS[name](config.agent, env) for name in algorithms)
+
+
+def stack_slots(slots: Sequence[Slot]) -> Slot:
+    """Slots as one stacked pytree [P, ...]."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *slots)
+
+
+def candidate_slots(cost: TrainingCost, key: Key, constrained: float = 1.0) -> Slot:
+    """Slots [P] of stacked costs [P, ...] that share one key.
+
+    Common random numbers: all candidates of a stage meet the same layouts.
+    """
+    size = cost.limit.shape[0]
+    return Slot(
+        cost=cost,
+        key=jnp.broadcast_to(key, (size,)),
+        constrained=jnp.full((size,), constrained, jnp.float32),
+    )
+
+
+def jit_bundle(bundle: Any) -> Any:
+    """A NamedTuple of pure functions with each of them jitted."""
+    return type(bundle)(*(jax.jit(fn) for fn in bundle))
+
+
+def make_population(
+    env: Env,
+    agents: Sequence[Agent],
+    config: TrainConfig,
+    bank: Sequence[CostTerm] = BANK,
+    devices: Sequence[jax.Device] | None = None,
+) -> Population:
+    """The program that trains groups of slots, one group for each agent.
+
+    Args:
+      env: the environment all slots share.
+      agents: one algorithm for each group.
+      config: sizes; `segments_per_episode` must be 1.
+      bank: the cost terms.
+      devices: default: the first device only.
+
+    Raises:
+      ValueError: for `segments_per_episode` > 1, whose carried worlds the chunk does
+        not hold; `train.run_stage` does.
+    """
+    if config.segments_per_episode != 1:
+        raise ValueError(
+            "segments_per_episode must be 1 in a population, "
+            f"got {config.segments_per_episode}"
+        )
+    agents, bank = tuple(agents), tuple(bank)
+    mesh = Mesh(np.asarray(devices or jax.devices()[:1]), (AXIS,))
+    chunk_fn = _chunk_fn(env, agents, config, bank, mesh)
+    init_fn = jax.jit(_sharded(lambda slots: _init(agents, slots), mesh, P(AXIS)))
+    compiled: dict[str, Any] = {}
+
+    def init(slots: tuple[Slot, ...]) -> tuple[Learner, ...]:
+        return _unpad(init_fn(_pad(slots, mesh)), _sizes(slots))
+
+    def compile_(learners: tuple[Learner, ...], slots: tuple[Slot, ...]):
+        epoch = jnp.zeros((), jnp.int32)
+        lowered = chunk_fn.lower(_pad(learners, mesh), _pad(slots, mesh), epoch)
+        compiled["chunk"] = lowered.compile()
+        return compiled["chunk"]
+
+    def chunk(learners: tuple[Learner, ...], slots: tuple[Slot, ...], epoch: int):
+        run = compiled.get("chunk", chunk_fn)
+        learners, metrics = run(
+            _pad(learners, mesh), _pad(slots, mesh), jnp.asarray(epoch, jnp.int32)
+        )
+        sizes = _sizes(slots)
+        metrics = tuple(
+            {name: value[:, :size] for name, value in group.items()}
+            for group, size in zip(metrics, sizes, strict=True)
+        )
+        return _unpad(learners, sizes), metrics
+
+    return Population(init, chunk, compile_, mesh.size)
+
+
+def _init(agents: tuple[Agent, ...], slots: tuple[Slot, ...]) -> tuple[Learner, ...]:
+    return tuple(
+        jax.vmap(lambda slot, agent=agent: init_learner(agent, slot))(group)
+        for agent, group in zip(agents, slots, strict=True)
+    )
+
+
+def _chunk_fn(
+    env: Env,
+    agents: tuple[Agent, ...],
+    config: TrainConfig,
+    bank: tuple[CostTerm, ...],
+    mesh: Mesh,
+):
+    def chunk(learners: tuple[Learner, ...], slots: tuple[Slot, ...], epoch: jax.Array):
+        def body(learners: tuple[Learner, ...], epoch: jax.Array):
+            learners, _, metrics = run_epoch(
+                env, agents, config, learners, slots, None, epoch, bank
+            )
+            return learners, metrics
+
+        return jax.lax.scan(body, learners, epoch + jnp.arange(config.chunk_epochs))
+
+    sharded = jax.shard_map(
+        chunk,
+        mesh=mesh,
+        in_specs=(P(AXIS), P(AXIS), P()),
+        out_specs=(P(AXIS), P(None, AXIS)),
+        check_vma=False,
+    )
+    return jax.jit(sharded, donate_argnums=0)
+
+
+def _sharded(fn: Callable, mesh: Mesh, spec: P) -> Callable:
+    return jax.shard_map(
+        fn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+    )
+
+
+def _sizes(groups: tuple[Slot, ...]) -> list[int]:
+    return [group.key.shape[0] for group in groups]
+
+
+def _pad(groups: tuple[Any, ...], mesh: Mesh) -> tuple[Any, ...]:
+    """Each group filled up with copies of its first slot, laid over the devices."""
+
+    def pad(leaf: jax.Array) -> jax.Array:
+        missing = -leaf.shape[0] % mesh.size
+        if missing:
+            filler = jnp.broadcast_to(leaf[:1], (missing, *leaf.shape[1:]))
+            leaf = jnp.concatenate([leaf, filler])
+        return jax.device_put(leaf, NamedSharding(mesh, P(AXIS)))
+
+    return tuple(jax.tree.map(pad, group) for group in groups)
+
+
+def _unpad(groups: tuple[Any, ...], sizes: list[int]) -> tuple[Any, ...]:
+    return tuple(
+        jax.tree.map(lambda leaf, size=size: leaf[:size], group)
+        for group, size in zip(groups, sizes, strict=True)
+    )

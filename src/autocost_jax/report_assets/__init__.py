@@ -1,0 +1,1 @@
+"""Parts of the report: its records, its figures, and the page's static text."""

@@ -1,0 +1,333 @@
+"""What a report is made of: plain records, and the evolved cost in NumPy."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+BestLabel = Literal["zero violation, highest return", "lowest cost"]
+
+LIDAR_BINS = 8
+HIDDEN = 4
+THETA_SIZE = LIDAR_BINS * HIDDEN + HIDDEN + HIDDEN + 1
+TIMID_DISTANCE = 1.0  # metres an episode; an agent below it hardly moves
+
+
+@dataclass(frozen=True, eq=False)
+class StageRecord:
+    """One finished stage of the search.
+
+    Attributes:
+      theta: [P, 41] the candidates' networks.
+      cost: [P] extrinsic cost of an episode, mean over algorithms; +inf: frozen.
+      ep_return: [P] return of an episode, mean over algorithms; -inf: frozen.
+      algorithm_cost: [A, P] the same cost of each algorithm's agent.
+      algorithm_return: [A, P] the same return of each algorithm's agent.
+      zero_violation: [P] bool, whether no fitness episode had any extrinsic cost.
+      elites: [K] indices of the candidates that were selected, best first.
+      far_cost: [P] mean intrinsic cost over visited states far from hazards, or None.
+      near_cost: [P] the same close to hazards, or None. NaN: no such state.
+      distance_travelled: [A, P] metres an episode, or None.
+    """
+
+    theta: Array
+    cost: Array
+    ep_return: Array
+    algorithm_cost: Array
+    algorithm_return: Array
+    zero_violation: Array
+    elites: Array
+    far_cost: Array | None = None
+    near_cost: Array | None = None
+    distance_travelled: Array | None = None
+
+    @property
+    def finite(self) -> Array:
+        """[P] bool, False where a candidate is frozen."""
+        return np.isfinite(self.cost) & np.isfinite(self.ep_return)
+
+    @property
+    def mean_cost(self) -> float:
+        """Mean extrinsic cost over the finite candidates; NaN without any."""
+        return finite_mean(self.cost[self.finite])
+
+    @property
+    def mean_return(self) -> float:
+        """Mean return over the finite candidates; NaN without any."""
+        return finite_mean(self.ep_return[self.finite])
+
+    @property
+    def timid_share(self) -> float:
+        """Share of agents travelling less than `TIMID_DISTANCE`; NaN if unknown."""
+        if self.distance_travelled is None:
+            return float("nan")
+        known = np.isfinite(self.distance_travelled)
+        return finite_mean(self.distance_travelled[known] < TIMID_DISTANCE)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """How one algorithm learnt in one stage.
+
+    Attributes:
+      stage: index into `ReportData.stages`, from 0; may point at the stage that is
+        still running.
+      algorithm: one of `ReportData.algorithms`.
+      epoch: [E] epoch numbers within the stage.
+      ep_return: [E, P] return of an episode, by candidate.
+      ep_cost: [E, P] extrinsic cost of an episode.
+      ep_total_cost: [E, P] extrinsic + intrinsic, what the learner sees.
+    """
+
+    stage: int
+    algorithm: str
+    epoch: Array
+    ep_return: Array
+    ep_cost: Array
+    ep_total_cost: Array
+
+
+@dataclass(frozen=True, eq=False)
+class BestCandidate:
+    """The search's result.
+
+    Attributes:
+      stage: index into `ReportData.stages`, from 0.
+      index: its row in that stage.
+      theta: [41] its network.
+      label: why it is the best; checked against the stage's `zero_violation`.
+      card: lines that describe the saved cost.
+    """
+
+    stage: int
+    index: int
+    theta: Array
+    label: BestLabel
+    card: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """One recorded episode; row t is the state after step t, world frame, metres.
+
+    Attributes:
+      robot_xy: [T, 2] robot origin.
+      robot_yaw: [T] heading, radians counter-clockwise from +x.
+      goal_xy: [T, 2] goal centre.
+      hazards: [H, 2] centres of the constraint objects (hazards or pillars).
+      hazard_radius: their radius.
+      goal_radius: radius of the goal.
+      cost: [T] extrinsic cost of each step.
+      reward: [T] reward of each step.
+      constraint_lidar: [T, 8] the network's input, robot frame.
+      intrinsic: [T] intrinsic cost of each step.
+      dt: seconds a step.
+      extents: (xmin, ymin, xmax, ymax) of the placements.
+      label: which policy this is, such as "PPO-Lagrangian, sampled actions".
+      box_xy: [T, 2] box centre of a push task, or None.
+      box_size: half the edge of the box.
+    """
+
+    robot_xy: Array
+    robot_yaw: Array
+    goal_xy: Array
+    hazards: Array
+    hazard_radius: float
+    goal_radius: float
+    cost: Array
+    reward: Array
+    constraint_lidar: Array
+    intrinsic: Array
+    dt: float
+    extents: tuple[float, float, float, float]
+    label: str = ""
+    box_xy: Array | None = None
+    box_size: float = 0.2
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One row of the evaluation table.
+
+    Attributes:
+      label: policy and environment.
+      return_mean: mean return of an episode.
+      return_ci: half-width of its 95 % interval.
+      cost_mean: mean extrinsic cost of an episode.
+      cost_ci: half-width of its 95 % interval.
+      violation_rate: share of episodes with any extrinsic cost.
+      episodes: how many episodes were run.
+    """
+
+    label: str
+    return_mean: float
+    return_ci: float
+    cost_mean: float
+    cost_ci: float
+    violation_rate: float
+    episodes: int
+
+
+@dataclass(frozen=True, eq=False)
+class ReportData:
+    """Everything a report shows.
+
+    Attributes:
+      title: name of the run.
+      config: what to show about the run, in order; the tiles at the top use the
+        keys "env steps", "duration", "steps/s" and "device" if they are there.
+      algorithms: the A names, in the order of the [A, P] arrays.
+      deterministic: whether the scored policies used the mean action.
+      hazard_radius: radius of a constraint object, for the heat map.
+      stages: the finished stages; empty while the first is running.
+      best: the result, or None if no stage has a finite candidate.
+      curves: learning curves, any order.
+      control_cost: [S] stage means of the extrinsic cost of a search whose
+        selection is random, or None.
+      control_return: [S] the same of the return, or None.
+      replay: an episode of the best policy, or None.
+      evaluations: rows of the evaluation table.
+
+    Raises:
+      ValueError: if shapes disagree, an index does not exist, or the best
+        candidate's label contradicts its stage.
+    """
+
+    title: str
+    config: Mapping[str, str]
+    algorithms: tuple[str, ...]
+    deterministic: bool
+    hazard_radius: float
+    stages: tuple[StageRecord, ...] = ()
+    best: BestCandidate | None = None
+    curves: tuple[Curve, ...] = ()
+    control_cost: Array | None = None
+    control_return: Array | None = None
+    replay: Replay | None = None
+    evaluations: tuple[Evaluation, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        for number, stage in enumerate(self.stages):
+            _check_stage(stage, len(self.algorithms), f"stages[{number}]")
+        for number, curve in enumerate(self.curves):
+            _check_curve(curve, self.algorithms, f"curves[{number}]")
+        if self.best is not None:
+            _check_best(self.best, self.stages)
+        if self.replay is not None:
+            _check_replay(self.replay)
+
+
+def _shape(value: Any, shape: tuple[int, ...], name: str) -> None:
+    if value is not None and np.shape(value) != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
+
+
+def _check_stage(stage: StageRecord, algorithms: int, name: str) -> None:
+    size = np.shape(stage.cost)[0] if np.ndim(stage.cost) == 1 else -1
+    if size < 1:
+        raise ValueError(f"{name}.cost must be [P], got shape {np.shape(stage.cost)}")
+    _shape(stage.theta, (size, THETA_SIZE), f"{name}.theta")
+    for key in ("ep_return", "zero_violation", "far_cost", "near_cost"):
+        _shape(getattr(stage, key), (size,), f"{name}.{key}")
+    for key in ("algorithm_cost", "algorithm_return", "distance_travelled"):
+        _shape(getattr(stage, key), (algorithms, size), f"{name}.{key}")
+    if np.any((stage.elites < 0) | (stage.elites >= size)):
+        raise ValueError(f"{name}.elites must be in [0, {size}), got {stage.elites}")
+
+
+def _check_curve(curve: Curve, algorithms: tuple[str, ...], name: str) -> None:
+    if curve.algorithm not in algorithms:
+        raise ValueError(
+            f"{name}.algorithm must be one of {', '.join(algorithms)}, "
+            f"got {curve.algorithm!r}"
+        )
+    shape = np.shape(curve.ep_return)
+    if len(shape) != 2 or shape[0] != len(curve.epoch) or curve.stage < 0:
+        raise ValueError(f"{name}.ep_return must be [E, P], got shape {shape}")
+    _shape(curve.ep_cost, shape, f"{name}.ep_cost")
+    _shape(curve.ep_total_cost, shape, f"{name}.ep_total_cost")
+
+
+def _check_best(best: BestCandidate, stages: tuple[StageRecord, ...]) -> None:
+    _shape(best.theta, (THETA_SIZE,), "best.theta")
+    if not 0 <= best.stage < len(stages):
+        raise ValueError(f"best.stage must be in [0, {len(stages)}), got {best.stage}")
+    zero = stages[best.stage].zero_violation
+    if not 0 <= best.index < len(zero):
+        raise ValueError(f"best.index must be in [0, {len(zero)}), got {best.index}")
+    allowed = "zero violation, highest return" if zero[best.index] else "lowest cost"
+    if best.label != allowed:
+        raise ValueError(
+            f"best.label must be {allowed!r} for this candidate, got {best.label!r}"
+        )
+
+
+def _check_replay(replay: Replay) -> None:
+    steps = len(replay.cost)
+    for key in ("robot_xy", "goal_xy", "box_xy"):
+        _shape(getattr(replay, key), (steps, 2), f"replay.{key}")
+    for key in ("robot_yaw", "reward", "intrinsic"):
+        _shape(getattr(replay, key), (steps,), f"replay.{key}")
+    _shape(replay.constraint_lidar, (steps, LIDAR_BINS), "replay.constraint_lidar")
+    _shape(replay.hazards, (len(replay.hazards), 2), "replay.hazards")
+
+
+def finite_mean(values: Array) -> float:
+    """Mean of the finite values; NaN if there are none."""
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if values.size else float("nan")
+
+
+def object_lidar(ego_xy: Array) -> Array:
+    """The 8-bin exponential lidar (gain 1) of a single object.
+
+    Args:
+      ego_xy: [..., 2] the object's centre in the robot frame, metres.
+
+    Returns:
+      [..., 8] readings in [0, 1]; several objects combine by their maximum.
+
+    Source: openai/safety-gym engine.py, obs_lidar_pseudo, with aliasing.
+    """
+    x, y = np.moveaxis(np.asarray(ego_xy, float), -1, 0)
+    strength = np.exp(-np.hypot(x, y))
+    position = np.mod(np.arctan2(y, x), 2 * np.pi) / (2 * np.pi / LIDAR_BINS)
+    index = np.floor(position).astype(int)
+    alias = position - index
+    bins = np.arange(LIDAR_BINS)
+
+    def at(shift: int, value: Array) -> Array:
+        hit = (index[..., None] + shift) % LIDAR_BINS == bins
+        return np.where(hit, value[..., None], 0.0)
+
+    own, above, below = (
+        at(0, strength),
+        at(1, alias * strength),
+        at(-1, (1 - alias) * strength),
+    )
+    return np.maximum(own, np.maximum(above, below))
+
+
+def network_cost(theta: Array, lidar: Array) -> Array:
+    """The intrinsic cost in NumPy, independent of the JAX implementation.
+
+        c = sigmoid(W2 . sigmoid(W1 l + b1) + b2)
+
+    Args:
+      theta: [41] W1 row-major 8 x 4, b1, W2, b2.
+      lidar: [..., 8] readings in [0, 1].
+
+    Returns:
+      [...] cost in (0, 1).
+    """
+    theta = np.asarray(theta, float)
+    first, end = LIDAR_BINS * HIDDEN, LIDAR_BINS * HIDDEN + HIDDEN
+    hidden = lidar @ theta[:first].reshape(LIDAR_BINS, HIDDEN) + theta[first:end]
+    return _sigmoid(_sigmoid(hidden) @ theta[end:-1] + theta[-1])
+
+
+def _sigmoid(x: Array) -> Array:
+    return 0.5 * (1 + np.tanh(x / 2))  # does not overflow for steep networks

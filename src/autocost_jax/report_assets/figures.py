@@ -1,0 +1,366 @@
+"""Figures of a search, drawn with matplotlib but without pyplot's global state.
+
+`stage_scatter`, `learning_curves` and `heat_map` return a `Figure` to save as PNG or
+PDF; `panels` returns the same drawings one by one, for the page.
+"""
+
+import io
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from autocost_jax.report_assets.data import (
+    TIMID_DISTANCE,
+    Array,
+    ReportData,
+    network_cost,
+    object_lidar,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, MUTED, GRID, PAPER = "#1c2430", "#5b6675", "#e3e7ec", "#fefefe"
+ZERO, BEST, MEAN, LIMIT = "#00815a", "#0b62a8", "#b84a06", "#b3261e"
+ALGORITHM_COLOURS = (BEST, MEAN, "#7a3f9d", "#4d5b1f")
+# on the page these become CSS variables, so that figures follow the dark mode
+CSS_VARIABLES = {
+    INK: "ink", MUTED: "muted", GRID: "grid", PAPER: "card", ZERO: "zero",
+    BEST: "best", MEAN: "mean", LIMIT: "limit", ALGORITHM_COLOURS[2]: "third",
+    ALGORITHM_COLOURS[3]: "fourth",
+}  # fmt: skip
+NAMES = {"ppo_lagrangian": "PPO-Lagrangian", "cpo": "CPO"}
+WIDE_COST = 20.0  # above it a cost axis is logarithmic beyond 1
+Draw = Callable[["Axes"], Any]
+
+
+def stage_scatter(data: ReportData) -> "Figure":
+    """The paper's evolution figure, the returns, and the share of timid agents."""
+    return _row([draw for _, draw in stage_panels(data)])
+
+
+def learning_curves(data: ReportData) -> "Figure":
+    """Return, extrinsic and total cost by epoch, consecutive stages along x."""
+    return _row([draw for _, draw in curve_panels(data)])
+
+
+def heat_map(theta: Array, hazard_radius: float) -> "Figure":
+    """The evolved cost around one hazard at the origin, and its radial profile.
+
+    Args:
+      theta: [41] parameters of the network.
+      hazard_radius: metres.
+    """
+    return _row([draw for _, draw in heat_panels(theta, hazard_radius)])
+
+
+def stage_panels(data: ReportData) -> list[tuple[str, Draw]]:
+    """(name, drawing) of each panel of `stage_scatter`."""
+    panels: list[tuple[str, Draw]] = [
+        ("cost", lambda axes: _draw_stage_cost(axes, data)),
+        ("return", lambda axes: _draw_stage_return(axes, data)),
+    ]
+    if any(np.isfinite(stage.timid_share) for stage in data.stages):
+        panels.append(("timid", lambda axes: _draw_timid(axes, data)))
+    return panels
+
+
+def curve_panels(data: ReportData) -> list[tuple[str, Draw]]:
+    """(name, drawing) of each panel of `learning_curves`."""
+
+    def panel(field: str, label: str) -> tuple[str, Draw]:
+        return field, lambda axes: _draw_curves(axes, data, field, label)
+
+    return [
+        panel("ep_return", "return an episode"),
+        panel("ep_cost", "extrinsic cost an episode"),
+        panel("ep_total_cost", "total cost an episode"),
+    ]
+
+
+def heat_panels(theta: Array, hazard_radius: float) -> list[tuple[str, Draw]]:
+    """(name, drawing) of each panel of `heat_map`."""
+    return [
+        ("map", lambda axes: _draw_heat(axes, theta, hazard_radius)),
+        ("profile", lambda axes: _draw_profile(axes, theta, hazard_radius)),
+    ]
+
+
+def panel_svg(draw: Draw, name: str, label: str) -> str:
+    """One panel as an inline `<svg>` that follows the page's colours.
+
+    Args:
+      draw: fills an `Axes`.
+      name: prefix of the ids, unique on the page.
+      label: text alternative, already escaped for an attribute.
+    """
+    import matplotlib
+
+    figure = _figure(4.6, 3.3)
+    draw(_axes(figure, 1, 1))
+    buffer = io.StringIO()
+    none = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata=none)
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    head, body = svg.split(">", 1)
+    view = re.search(r'viewBox="[^"]*"', head)
+    body = re.sub(r'\bid="', f'id="{name}-', body)
+    body = re.sub(r'href="#', f'href="#{name}-', body)
+    body = re.sub(r"url\(#", f"url(#{name}-", body)
+    body = re.sub(r"(font: [^;\"]*?px) [^;\"]*", r"\1 var(--sans)", body)
+    for colour, variable in CSS_VARIABLES.items():
+        body = body.replace(colour, f"var(--{variable})")
+    size = view.group(0) if view else ""
+    return f'<svg {size} role="img" aria-label="{label}">{body}'
+
+
+def _figure(width: float, height: float) -> "Figure":
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=150, layout="constrained")
+
+
+def _axes(figure: "Figure", columns: int, number: int) -> "Axes":
+    axes = figure.add_subplot(1, columns, number)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(MUTED)
+    axes.tick_params(colors=MUTED, labelcolor=INK, labelsize=8.5, length=3)
+    axes.grid(axis="y", color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    return axes
+
+
+def _row(draws: list[Draw]) -> "Figure":
+    figure = _figure(4.6 * len(draws), 3.4)
+    for number, draw in enumerate(draws, 1):
+        draw(_axes(figure, len(draws), number))
+    return figure
+
+
+def _label(axes: "Axes", x: str, y: str) -> None:
+    axes.set_xlabel(x, color=INK, fontsize=9)
+    axes.set_ylabel(y, color=INK, fontsize=9)
+
+
+def _legend(axes: "Axes", columns: int = 3) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        axes.legend(
+            handles, labels, loc="lower left", bbox_to_anchor=(-0.02, 1.0),
+            ncol=columns, frameon=False, fontsize=8.5, labelcolor=INK,
+            handlelength=1.4, handletextpad=0.5, columnspacing=1.1,
+        )  # fmt: skip
+
+
+def _cost_axis(axes: "Axes", values: Array, label: str) -> str:
+    """Scales y for costs; returns the axis label, which says if it is logarithmic."""
+    values = values[np.isfinite(values)]
+    top = float(values.max()) if values.size else 1.0
+    low = float(values.min()) if values.size else 0.0
+    if top <= WIDE_COST:
+        span = max(top, 0.1)
+        axes.set_ylim(min(-0.04 * span, 1.1 * low), 1.12 * span)
+        return label
+    from matplotlib.ticker import FuncFormatter
+
+    axes.set_yscale("symlog", linthresh=1.0)
+    axes.set_ylim(min(-0.12, 1.1 * low), 2.2 * top)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.6g}"))
+    return f"{label} (log above 1)"
+
+
+def _stage_ticks(axes: "Axes", stages: int) -> None:
+    axes.set_xlim(0.45, max(stages, 1) + 0.55)
+    axes.set_xticks(range(1, stages + 1))
+
+
+def _spread(number: int, size: int) -> Array:
+    """[P] x positions around a stage's tick, by candidate, so that dots stay apart."""
+    return number + (np.linspace(-0.26, 0.26, size) if size > 1 else np.zeros(1))
+
+
+def _draw_dots(axes: "Axes", data: ReportData, field: str) -> None:
+    for number, stage in enumerate(data.stages, 1):
+        values, finite = getattr(stage, field), stage.finite
+        x = _spread(number, len(values))
+        elite = np.isin(np.arange(len(values)), stage.elites)
+        zero = stage.zero_violation.astype(bool)
+        for chosen, edge, face, width in (
+            (~zero & ~elite, MUTED, PAPER, 0.8),
+            (~zero & elite, INK, PAPER, 1.7),
+            (zero & ~elite, ZERO, ZERO, 0.8),
+            (zero & elite, INK, ZERO, 1.7),
+        ):
+            pick = chosen & finite
+            axes.scatter(
+                x[pick], values[pick], s=26, facecolors=face, edgecolors=edge,
+                linewidths=width, zorder=3, clip_on=False,
+            )  # fmt: skip
+        if not finite.all():
+            axes.plot(
+                x[~finite], np.full((~finite).sum(), 0.98), "x", color=LIMIT,
+                markersize=5, transform=axes.get_xaxis_transform(), clip_on=False,
+            )  # fmt: skip
+
+
+def _dot_legend(axes: "Axes", data: ReportData) -> None:
+    """Adds the legend entries of the kinds of dots that occur."""
+    zero = any(stage.zero_violation.any() for stage in data.stages)
+    frozen = any(not stage.finite.all() for stage in data.stages)
+    kinds = [("o", PAPER, MUTED, 0.8, "candidate"), ("o", PAPER, INK, 1.7, "selected")]
+    if zero:
+        kinds.append(("o", ZERO, ZERO, 0.8, "zero violation"))
+    if frozen:
+        kinds.append(("x", LIMIT, LIMIT, 1.2, "diverged"))
+    for marker, face, edge, width, label in kinds:
+        axes.plot(
+            [], [], marker, markersize=5.2, markerfacecolor=face,
+            markeredgecolor=edge, markeredgewidth=width, label=label,
+        )  # fmt: skip
+
+
+def _control(axes: "Axes", values: Array | None) -> None:
+    if values is not None and len(values):
+        x = np.arange(1, len(values) + 1)
+        axes.plot(x, values, "--", color=MUTED, lw=1.4, label="random control, mean")
+
+
+def _draw_stage_cost(axes: "Axes", data: ReportData) -> None:
+    stages = data.stages
+    x = np.arange(1, len(stages) + 1)
+    best = [np.min(s.cost[s.finite], initial=np.inf) for s in stages]
+    best = [value if np.isfinite(value) else np.nan for value in best]
+    values = np.concatenate([s.cost[s.finite] for s in stages] or [np.zeros(0)])
+    label = _cost_axis(axes, values, "extrinsic cost an episode")
+    axes.axhline(0, color=LIMIT, lw=1.2, zorder=1)
+    _draw_dots(axes, data, "cost")
+    axes.plot(x, [s.mean_cost for s in stages], color=MEAN, lw=2, label="mean")
+    axes.plot(x, best, color=BEST, lw=2, label="lowest")
+    _control(axes, data.control_cost)
+    _dot_legend(axes, data)
+    _legend(axes)
+    _stage_ticks(axes, len(stages))
+    _label(axes, "stage", label)
+
+
+def _draw_stage_return(axes: "Axes", data: ReportData) -> None:
+    stages = data.stages
+    x = np.arange(1, len(stages) + 1)
+    elite = []
+    for stage in stages:
+        chosen = np.isin(np.arange(len(stage.cost)), stage.elites) & stage.finite
+        elite.append(np.mean(stage.ep_return[chosen]) if chosen.any() else np.nan)
+    _draw_dots(axes, data, "ep_return")
+    axes.plot(x, [s.mean_return for s in stages], color=MEAN, lw=2, label="mean")
+    axes.plot(x, elite, color=BEST, lw=2, label="mean of the selected")
+    _control(axes, data.control_return)
+    _legend(axes)
+    _stage_ticks(axes, len(stages))
+    _label(axes, "stage", "return an episode")
+
+
+def _draw_timid(axes: "Axes", data: ReportData) -> None:
+    stages = data.stages
+    x = np.arange(1, len(stages) + 1)
+    share = np.array([100 * stage.timid_share for stage in stages])
+    axes.bar(x, share, width=0.5, color=MUTED, zorder=2)
+    for place, value in zip(x, share, strict=True):
+        if np.isfinite(value):
+            axes.annotate(
+                f"{value:.0f} %", (place, value), (0, 3), textcoords="offset points",
+                ha="center", fontsize=8.5, color=INK,
+            )  # fmt: skip
+    axes.set_ylim(0, 109)
+    axes.set_yticks([0, 25, 50, 75, 100])
+    _stage_ticks(axes, len(stages))
+    _label(axes, "stage", f"agents moving less than {TIMID_DISTANCE:g} m, %")
+
+
+def _quartiles(values: Array) -> Array:
+    """[3, E] quartiles over the finite candidates of each epoch; NaN without any."""
+    rows = [row[np.isfinite(row)] for row in np.asarray(values, float)]
+    quartiles = [
+        np.percentile(row, [25, 50, 75]) if row.size else np.full(3, np.nan)
+        for row in rows
+    ]
+    return np.array(quartiles).reshape(-1, 3).T
+
+
+def _draw_curves(axes: "Axes", data: ReportData, field: str, label: str) -> None:
+    stages = 1 + max((curve.stage for curve in data.curves), default=-1)
+    length = np.zeros(stages + 1, int)
+    for curve in data.curves:
+        length[curve.stage + 1] = max(length[curve.stage + 1], len(curve.epoch))
+    start = np.cumsum(length)
+    drawn, seen = [np.zeros(0)], set()
+    for curve in data.curves:
+        kind = data.algorithms.index(curve.algorithm)
+        colour = ALGORITHM_COLOURS[kind % len(ALGORITHM_COLOURS)]
+        name = NAMES.get(curve.algorithm, curve.algorithm).replace("$", r"\$")
+        x = start[curve.stage] + 1 + np.arange(len(curve.epoch))
+        low, middle, high = _quartiles(getattr(curve, field))
+        drawn += [low, high]
+        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
+        first = name if name not in seen else None
+        axes.plot(x, middle, color=colour, lw=1.6, label=first)
+        seen.add(name)
+    for number in range(stages):
+        if number:
+            axes.axvline(start[number] + 0.5, color=MUTED, lw=0.8, ls=":")
+        axes.annotate(
+            f"stage {number + 1}" if stages <= 4 else f"{number + 1}",
+            ((start[number] + start[number + 1] + 1) / 2, 1), (0, -9),
+            xycoords=axes.get_xaxis_transform(), textcoords="offset points",
+            ha="center", fontsize=8, color=MUTED,
+        )  # fmt: skip
+    if field != "ep_return":
+        label = _cost_axis(axes, np.concatenate(drawn), label)
+    axes.margins(x=0.02, y=0.1)
+    _legend(axes)
+    _label(axes, "epoch, counted through the stages", label)
+
+
+def _draw_heat(axes: "Axes", theta: Array, radius: float) -> None:
+    from matplotlib.patches import Circle
+
+    reach = 4 * radius
+    side = np.linspace(-reach, reach, 161)
+    robot = np.stack(np.meshgrid(side, side), -1)
+    cost = network_cost(theta, object_lidar(-robot))
+    edge = reach + (side[1] - side[0]) / 2
+    image = axes.imshow(
+        cost, origin="lower", extent=(-edge, edge, -edge, edge), cmap="viridis",
+        vmin=0.0, vmax=max(float(cost.max()), 1e-12), interpolation="bilinear",
+    )  # fmt: skip
+    axes.add_patch(Circle((0, 0), radius, fill=False, color="white", lw=1.8))
+    axes.add_patch(Circle((0, 0), radius, fill=False, color="black", lw=0.7))
+    axes.grid(visible=False)
+    figure = axes.get_figure()
+    if figure is not None:
+        bar = figure.colorbar(image, ax=axes, shrink=0.95, pad=0.03)
+        bar.ax.tick_params(colors=MUTED, labelcolor=INK, labelsize=8.5, length=3)
+        bar.set_label("intrinsic cost a step", color=INK, fontsize=9)
+        bar.outline.set_edgecolor(MUTED)  # pyright: ignore
+    _label(axes, "robot x, m", "robot y, m")
+
+
+def _draw_profile(axes: "Axes", theta: Array, radius: float) -> None:
+    distance = np.linspace(0, 6 * radius, 181)[:, None]
+    bearing = np.linspace(-np.pi, np.pi, 144, endpoint=False)
+    ego = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], -1)
+    cost = network_cost(theta, object_lidar(ego))
+    x = distance[:, 0]
+    axes.axvspan(0, radius, color=LIMIT, alpha=0.1, lw=0, label="inside the hazard")
+    axes.fill_between(
+        x, cost.min(1), cost.max(1), color=BEST, alpha=0.18, lw=0, label="range"
+    )
+    axes.plot(x, cost.mean(1), color=BEST, lw=2, label="mean over bearings")
+    axes.set_ylim(0, 1.05 * max(float(cost.max()), 1e-12))
+    axes.set_xlim(0, x[-1])
+    _legend(axes)
+    _label(axes, "distance to the hazard's centre, m", "intrinsic cost a step")

@@ -1,0 +1,327 @@
+"""One epoch of training for groups of slots: unroll -> cost -> update.
+
+A group is the slots of one algorithm, stacked on a leading axis P. All groups of a
+population share one rollout, so the physics is traced, compiled and stepped once.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from autocost_jax.agents.base import Agent
+from autocost_jax.config import TrainConfig
+from autocost_jax.costs import BANK, CostTerm, intrinsic_cost, total_cost
+from autocost_jax.envs.env import Env
+from autocost_jax.records import EnvState, Key, Metrics, Slot, Trajectory
+from autocost_jax.rollout import (
+    carry_cohorts,
+    join_cohorts,
+    reset_worlds,
+    unroll_batch,
+)
+
+# Purposes of a slot's keys: every key is fold_in(slot.key, epoch, purpose).
+INIT, RESET, ACT, UPDATE = range(4)
+
+
+class Learner(struct.PyTreeNode):
+    """One slot's agent and whether it still learns.
+
+    Attributes:
+      agent: the agent's own state.
+      frozen: [] bool; True once anything of it was non-finite. `agent` is then the
+        last finite state.
+      frozen_epoch: [] int32 epoch in which that happened, else -1.
+    """
+
+    agent: Any
+    frozen: jax.Array
+    frozen_epoch: jax.Array
+
+
+def slot_key(slot: Slot, epoch: jax.Array | int, purpose: int) -> Key:
+    """The key of a slot for one epoch and purpose."""
+    return jax.random.fold_in(jax.random.fold_in(slot.key, epoch), purpose)
+
+
+def init_learner(agent: Agent, slot: Slot) -> Learner:
+    """A fresh learner for one slot; vmap it for a group."""
+    return Learner(
+        agent=agent.init(slot_key(slot, 0, INIT)),
+        frozen=jnp.zeros((), bool),
+        frozen_epoch=jnp.full((), -1, jnp.int32),
+    )
+
+
+def run_epoch(
+    env: Env,
+    agents: Sequence[Agent],
+    config: TrainConfig,
+    learners: tuple[Learner, ...],
+    slots: tuple[Slot, ...],
+    carried: EnvState | None,
+    epoch: jax.Array,
+    bank: Sequence[CostTerm] = BANK,
+) -> tuple[tuple[Learner, ...], EnvState | None, tuple[Metrics, ...]]:
+    """One epoch of every slot of every group.
+
+    Args:
+      env: the environment all slots share.
+      agents: one algorithm for each group.
+      config: sizes of the epoch.
+      learners: for each group, stacked [P_g, ...].
+      slots: for each group, stacked [P_g, ...].
+      carried: older cohorts [sum P_g, (k - 1) N, ...]; None for k = 1.
+      epoch: [] int32, counted from the start of the stage.
+      bank: the cost terms, static.
+
+    Returns:
+      Learners, carried worlds, and for each group metrics [P_g].
+    """
+    worlds, trajectory, start = _rollout(
+        env, agents, config, learners, slots, carried, epoch
+    )
+    travelled = jax.tree.map(
+        lambda end, begin: (end - begin).astype(jnp.float32),
+        worlds.metrics,
+        start.metrics,
+    )
+    after, metrics = [], []
+    for agent, learner, slot, part in zip(
+        agents, learners, slots, _parts(slots), strict=True
+    ):
+
+        def update(learner: Learner, slot: Slot, trajectory, counts, agent=agent):
+            return _update(
+                env, agent, config, learner, slot, trajectory, counts, epoch, bank
+            )
+
+        group_trajectory = jax.tree.map(lambda x, part=part: x[:, part], trajectory)
+        counts = jax.tree.map(lambda x, part=part: x[part], travelled)
+        learner, group_metrics = jax.vmap(update, in_axes=(0, 0, 1, 0))(
+            learner, slot, group_trajectory, counts
+        )
+        after.append(learner)
+        metrics.append(group_metrics)
+    carried = carry_cohorts(worlds, config.num_worlds, config.segments_per_episode, 1)
+    return tuple(after), carried, tuple(metrics)
+
+
+def init_worlds(
+    env: Env,
+    agents: Sequence[Agent],
+    config: TrainConfig,
+    learners: tuple[Learner, ...],
+    slots: tuple[Slot, ...],
+) -> EnvState | None:
+    """The carried cohorts a stage starts with, of true ages; None for k = 1.
+
+    Cohort j has stepped j / k of an episode with the initial policies; what they saw
+    is discarded.
+    """
+    segments = config.segments_per_episode
+    if segments == 1:
+        return None
+    keys = jnp.concatenate([slot.key for slot in slots])
+    num_carried = config.num_worlds * (segments - 1)
+    carried = jax.vmap(
+        lambda key: reset_worlds(env, jax.random.fold_in(key, INIT), num_carried)
+    )(keys)
+
+    def warm_up(carried: EnvState, segment: jax.Array):
+        # Negative epochs: their keys are not those of any training epoch.
+        worlds, _, _ = _rollout(
+            env, agents, config, learners, slots, carried, -1 - segment
+        )
+        return carry_cohorts(worlds, config.num_worlds, segments, 1), None
+
+    carried, _ = jax.lax.scan(warm_up, carried, jnp.arange(segments - 1))
+    return carried
+
+
+def train(
+    env: Env,
+    agent: Agent,
+    slot: Slot,
+    config: TrainConfig,
+    bank: Sequence[CostTerm] = BANK,
+) -> tuple[Any, Metrics]:
+    """Train one slot for `config.num_epochs` epochs; jit and vmap it as you like.
+
+    Args:
+      env: the environment.
+      agent: `ppo_lagrangian(...)`, `cpo(...)` or your own.
+      slot: the slot's cost, key and switch.
+      config: sizes.
+      bank: the cost terms that `slot.cost.weights` weighs.
+
+    Returns:
+      The agent's state and metrics [num_epochs].
+    """
+    slots = jax.tree.map(lambda x: x[None], slot)
+    learners = jax.vmap(lambda slot: init_learner(agent, slot))(slots)
+    learners, metrics = run_stage(env, (agent,), config, (learners,), (slots,), bank)
+    first = jax.tree.map(lambda x: x[0], learners[0].agent)
+    return first, {name: value[:, 0] for name, value in metrics[0].items()}
+
+
+def run_stage(
+    env: Env,
+    agents: Sequence[Agent],
+    config: TrainConfig,
+    learners: tuple[Learner, ...],
+    slots: tuple[Slot, ...],
+    bank: Sequence[CostTerm] = BANK,
+) -> tuple[tuple[Learner, ...], tuple[Metrics, ...]]:
+    """`config.num_epochs` epochs of fresh learners as one traceable function.
+
+    Returns:
+      Learners and for each group metrics [num_epochs, P_g].
+    """
+
+    def body(carry, epoch: jax.Array):
+        learners, carried = carry
+        learners, carried, metrics = run_epoch(
+            env, agents, config, learners, slots, carried, epoch, bank
+        )
+        return (learners, carried), metrics
+
+    carried = init_worlds(env, agents, config, learners, slots)
+    epochs = jnp.arange(config.num_epochs, dtype=jnp.int32)
+    (learners, _), metrics = jax.lax.scan(body, (learners, carried), epochs)
+    return learners, metrics
+
+
+def _parts(slots: tuple[Slot, ...]) -> list[slice]:
+    """Where each group lies on the joined slot axis."""
+    parts, start = [], 0
+    for slot in slots:
+        parts.append(slice(start, start + slot.key.shape[0]))
+        start = parts[-1].stop
+    return parts
+
+
+def _rollout(
+    env: Env,
+    agents: Sequence[Agent],
+    config: TrainConfig,
+    learners: tuple[Learner, ...],
+    slots: tuple[Slot, ...],
+    carried: EnvState | None,
+    epoch: jax.Array,
+) -> tuple[EnvState, Trajectory, EnvState]:
+    """All slots of all groups in one batch of worlds [sum P_g, k N, ...].
+
+    Returns the worlds after the epoch, the trajectory [T, sum P_g, k N, ...] and the
+    worlds before it.
+    """
+
+    def keys(purpose: int) -> list[Key]:
+        return [
+            jax.vmap(lambda slot: slot_key(slot, epoch, purpose))(s) for s in slots
+        ]
+
+    fresh = jax.vmap(lambda key: reset_worlds(env, key, config.num_worlds))(
+        jnp.concatenate(keys(RESET))
+    )
+    start = join_cohorts(fresh, carried, 1)
+    act_keys, parts = keys(ACT), _parts(slots)
+
+    def act(obs: jax.Array, t: jax.Array) -> jax.Array:
+        actions = []
+        for agent, learner, key, part in zip(
+            agents, learners, act_keys, parts, strict=True
+        ):
+            actions.append(
+                jax.vmap(
+                    lambda state, obs, key, agent=agent: agent.policy(
+                        state, obs, jax.random.fold_in(key, t)
+                    )
+                )(learner.agent, obs[part], key)
+            )
+        return jnp.concatenate(actions)
+
+    step = jax.vmap(jax.vmap(env.step))
+    worlds, trajectory = unroll_batch(step, act, start, config.epoch_steps)
+    return worlds, trajectory, start
+
+
+def _update(
+    env: Env,
+    agent: Agent,
+    config: TrainConfig,
+    learner: Learner,
+    slot: Slot,
+    trajectory: Trajectory,
+    counts: Metrics,
+    epoch: jax.Array,
+    bank: Sequence[CostTerm],
+) -> tuple[Learner, Metrics]:
+    """Learn from one slot's trajectory, or freeze at the last finite state."""
+    valid = trajectory.valid
+    total = total_cost(slot.cost, trajectory.cost_inputs, bank)
+    total = jnp.where(valid > 0, total, 0.0)
+    updated, metrics = agent.update(
+        learner.agent, trajectory, total, slot, slot_key(slot, epoch, UPDATE)
+    )
+    metrics = metrics | episode_metrics(
+        trajectory, total, slot.cost.theta, env.episode_length
+    )
+    episodes = 1.0 / config.segments_per_episode  # share of an episode in an epoch
+    for name, value in counts.items():
+        metrics[name] = jnp.mean(value) / episodes
+    healthy = _all_finite((updated, metrics)) & (jnp.sum(valid) > 0)
+    frozen = learner.frozen | ~healthy
+    first = frozen & ~learner.frozen
+    metrics["frozen"] = frozen.astype(jnp.float32)
+    return Learner(
+        agent=jax.tree.map(
+            lambda old, new: jnp.where(frozen, old, new), learner.agent, updated
+        ),
+        frozen=frozen,
+        frozen_epoch=jnp.where(first, epoch, learner.frozen_epoch),
+    ), metrics
+
+
+def episode_metrics(
+    trajectory: Trajectory, total: jax.Array, theta: jax.Array, episode_length: int
+) -> Metrics:
+    """What one slot's episodes looked like, scalars.
+
+    `ep_return`, `ep_cost` (extrinsic) and `ep_total_cost` (what the learner sees) are
+    undiscounted episode sums, estimated as episode_length x the mean over valid steps:
+    for whole episodes exactly their mean. `violating_worlds` is the share of worlds
+    with an extrinsic cost > 0 in this epoch, `intrinsic_far` and `intrinsic_near` the
+    mean intrinsic cost over visited states with D > 3 R and D < 1.5 R (0 if none).
+    """
+    inputs, valid = trajectory.cost_inputs, trajectory.valid
+
+    def mean(x: jax.Array, weight: jax.Array) -> jax.Array:
+        # The weights are counts: the floor only keeps 0 / 0 away.
+        return jnp.sum(weight * x) / jnp.maximum(jnp.sum(weight), 1.0)
+
+    intrinsic = intrinsic_cost(theta, inputs.constraint_lidar)
+    far = valid * (inputs.distance > 3.0 * inputs.radius)
+    near = valid * (inputs.distance < 1.5 * inputs.radius)
+    world_cost = jnp.sum(valid * inputs.cost, axis=0)
+    return {
+        "ep_return": episode_length * mean(trajectory.reward, valid),
+        "ep_cost": episode_length * mean(inputs.cost, valid),
+        "ep_total_cost": episode_length * mean(total, valid),
+        "violating_worlds": jnp.mean((world_cost > 0).astype(valid.dtype)),
+        "failed_worlds": jnp.sum(1.0 - valid[-1]),
+        "intrinsic_far": mean(intrinsic, far),
+        "intrinsic_near": mean(intrinsic, near),
+    }
+
+
+def _all_finite(tree: Any) -> jax.Array:
+    flags = [
+        jnp.all(jnp.isfinite(leaf))
+        for leaf in jax.tree.leaves(tree)
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
+    return jnp.all(jnp.stack(flags))
