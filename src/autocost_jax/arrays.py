@@ -114,7 +114,7 @@ def remove_temporaries(directory: Path) -> None:
 
 def is_key(leaf: Any) -> bool:
     """Whether an array, or the description of one, holds typed PRNG keys."""
-    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
@@ -144,6 +144,16 @@ def flatten(tree: Any) -> dict[str, np.ndarray]:
     }
 
 
+def stored_like(template: Any) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shape and dtype of what `flatten` returns, by path, without the data."""
+    return {
+        name: jax.eval_shape(jax.random.key_data, leaf)
+        if is_key(leaf)
+        else jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
+        for name, leaf in named_leaves(template).items()
+    }
+
+
 def unflatten(arrays: Mapping[str, np.ndarray], template: Any) -> Any:
     """A pytree like `template` out of arrays by path; the inverse of `flatten`.
 
@@ -157,16 +167,15 @@ def unflatten(arrays: Mapping[str, np.ndarray], template: Any) -> Any:
     """
     leaves = named_leaves(template)
     _check_names(arrays, leaves)
-    restored = [_restore(name, arrays[name], leaf) for name, leaf in leaves.items()]
+    for name, like in stored_like(template).items():
+        _check_array(name, arrays[name], like.shape, str(like.dtype))
+    restored = [_restore(arrays[name], leaf) for name, leaf in leaves.items()]
     return jax.tree.unflatten(jax.tree.structure(template), restored)
 
 
-def _restore(name: str, value: np.ndarray, leaf: Any) -> Any:
+def _restore(value: np.ndarray, leaf: Any) -> Any:
     if is_key(leaf):
-        like = jax.eval_shape(jax.random.key_data, leaf)
-        _check_array(name, value, like.shape, str(like.dtype))
         return jax.random.wrap_key_data(jnp.array(value), impl=_prng(leaf.dtype))
-    _check_array(name, value, leaf.shape, str(leaf.dtype))
     if isinstance(leaf, np.ndarray | np.generic):
         return value
     return jnp.array(value)  # a copy: borrowed numpy memory must not be donated
@@ -180,11 +189,14 @@ def _prng(key_dtype: Any) -> str:
     raise RunDirError(f"PRNG of {key_dtype} is unknown; known: {', '.join(_PRNGS)}")
 
 
-def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays to an uncompressed .npz, atomically; same arrays, same bytes."""
+def save_arrays(path: Path, tree: Any) -> None:
+    """Write a dict or other pytree of arrays to an .npz; same arrays, same bytes.
+
+    It is atomic and uncompressed; the names in the file are those of `flatten`.
+    """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        for name, array in flatten(dict(arrays)).items():
+        for name, array in flatten(tree).items():
             member = io.BytesIO()
             np.lib.format.write_array(member, array, allow_pickle=False)
             # ZipInfo's default date is fixed: the file depends on the arrays alone.

@@ -29,6 +29,7 @@ from autocost_jax.arrays import (
     fsync,
     named_leaves,
     remove,
+    stored_like,
     unflatten,
     write_atomic,
 )
@@ -64,15 +65,7 @@ def estimate_bytes(template: Any) -> int:
 
     While a run writes, `KEEP` + 1 of them are there.
     """
-    leaves = jax.eval_shape(
-        lambda tree: [
-            jax.random.key_data(leaf)
-            if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-            else leaf
-            for leaf in jax.tree.leaves(tree)
-        ],
-        template,
-    )
+    leaves = stored_like(template).values()
     data = sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
     return data + len(leaves) * _BYTES_PER_ARRAY + _BYTES_PER_CHECKPOINT
 
@@ -153,14 +146,19 @@ def load_latest(directory: Path, template: Any, config_hash: str) -> Checkpoint 
         path = directory / f"{_STEP}{step:08d}"
         try:
             manifest = _verify(path, step, config_hash)
-            arrays = _read_arrays(path / "arrays", manifest["arrays"])
+            arrays = _read_arrays(path / "arrays")
         except Exception as error:  # whatever is wrong with it, the one before is used
             reason = (str(error) or type(error).__name__).splitlines()[0]
             warnings.append(f"checkpoint {path} is broken: {reason}; not used")
             continue
         _check_description(path, manifest["arrays"], _describe(template))
+        empty = {
+            name: np.zeros(like.shape, like.dtype)
+            for name, like in stored_like(template).items()
+            if 0 in like.shape
+        }
         return Checkpoint(
-            tree=unflatten(arrays, template),
+            tree=unflatten({**arrays, **empty}, template),
             step=step,
             metrics_bytes=manifest["metrics_bytes"],
             extra=manifest["extra"],
@@ -236,7 +234,8 @@ def _hash_files(root: Path, sync: bool = False) -> dict[str, str]:
             if sync:
                 fsync(path)
             if path != root / _MANIFEST:
-                digest = hashlib.sha256(path.read_bytes()).hexdigest()
+                with path.open("rb") as file:
+                    digest = hashlib.file_digest(file, "sha256").hexdigest()
                 files[path.relative_to(root).as_posix()] = digest
         if sync:
             fsync(Path(folder))
@@ -275,12 +274,7 @@ def _write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
         checkpointer.save(path.absolute(), args=ocp.args.StandardSave(filled))
 
 
-def _read_arrays(path: Path, described: dict[str, dict]) -> dict[str, np.ndarray]:
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     with _checkpointer() as checkpointer:
-        filled = checkpointer.restore(path.absolute(), args=ocp.args.StandardRestore())
-    return {
-        name: np.asarray(filled[name])
-        if 0 not in leaf["shape"]
-        else np.zeros(leaf["shape"], leaf["dtype"])
-        for name, leaf in described.items()
-    }
+        arrays = checkpointer.restore(path.absolute(), args=ocp.args.StandardRestore())
+    return {name: np.asarray(array) for name, array in arrays.items()}

@@ -4,11 +4,36 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from autocost_jax.agents.base import Agent
 from autocost_jax.envs.env import Env
-from autocost_jax.records import EnvState, EvalResult, Key, Trajectory
-from autocost_jax.rollout import reset_worlds, unroll
+from autocost_jax.records import CostInputs, EnvState, EvalResult, Key, Layout
+from autocost_jax.rollout import reset_worlds
+
+
+class Episodes(struct.PyTreeNode):
+    """Whole episodes, step by step; row t is the state after step t, world frame.
+
+    Attributes:
+      start: layouts at the start, fields [E, ...].
+      robot_xy: [T, E, 2] robot origin, metres.
+      robot_yaw: [T, E] heading, radians.
+      goal_xy: [T, E, 2] goal centre, metres.
+      reward: [T, E].
+      cost_inputs: fields [T, E, ...].
+      valid: [T, E] 1.0 until the world fails.
+      distance_travelled: [E] path length, metres.
+    """
+
+    start: Layout
+    robot_xy: jax.Array
+    robot_yaw: jax.Array
+    goal_xy: jax.Array
+    reward: jax.Array
+    cost_inputs: CostInputs
+    valid: jax.Array
+    distance_travelled: jax.Array
 
 
 def run_episodes(
@@ -18,19 +43,49 @@ def run_episodes(
     key: Key,
     num_episodes: int,
     deterministic: bool = False,
-) -> tuple[EnvState, Trajectory]:
-    """`num_episodes` whole episodes side by side: the last worlds and all steps.
+) -> Episodes:
+    """`num_episodes` whole episodes side by side.
 
-    Returns:
-      Worlds [E, ...] and the Trajectory, fields [T, E, ...].
+    Args:
+      env: the environment.
+      agent: the algorithm the state belongs to.
+      agent_state: one agent's state.
+      key: consumed.
+      num_episodes: E.
+      deterministic: act by the mean instead of sampling.
     """
     key_reset, key_act = jax.random.split(key)
-    worlds = reset_worlds(env, key_reset, num_episodes)
+    start = reset_worlds(env, key_reset, num_episodes)
 
-    def policy(obs: jax.Array, key: Key) -> jax.Array:
-        return agent.policy(agent_state, obs, key, deterministic)
+    def body(worlds: EnvState, t: jax.Array):
+        action = agent.policy(
+            agent_state, worlds.obs, jax.random.fold_in(key_act, t), deterministic
+        )
+        worlds = jax.vmap(env.step)(worlds, action)
+        layout, valid = worlds.layout, (~worlds.failed).astype(worlds.reward.dtype)
+        poses = (layout.robot_xy, layout.robot_yaw, layout.goal_xy)
+        return worlds, (*poses, worlds.reward, worlds.cost_inputs, valid)
 
-    return unroll(env, policy, worlds, key_act, env.episode_length)
+    worlds, rows = jax.lax.scan(body, start, jnp.arange(env.episode_length))
+    return Episodes(
+        start.layout, *rows, worlds.metrics["distance_travelled"].astype(jnp.float32)
+    )
+
+
+def score(episodes: Episodes) -> EvalResult:
+    """The sums and the violation rate of whole episodes."""
+    valid = episodes.valid
+    ep_cost = jnp.sum(valid * episodes.cost_inputs.cost, axis=0)
+    whole = valid[-1]  # validity never comes back within an episode
+    violations = jnp.sum(whole * (ep_cost > 0))
+    return EvalResult(
+        ep_return=jnp.sum(valid * episodes.reward, axis=0),
+        ep_cost=ep_cost,
+        distance_travelled=episodes.distance_travelled,
+        valid=whole,
+        # A count of episodes: the floor only keeps 0 / 0 away.
+        violation_rate=violations / jnp.maximum(jnp.sum(whole), 1.0),
+    )
 
 
 def evaluate(
@@ -43,29 +98,11 @@ def evaluate(
 ) -> EvalResult:
     """Scores of a fixed policy over whole episodes of fresh layouts.
 
-    Args:
-      env: the environment.
-      agent: the algorithm the state belongs to.
-      agent_state: one agent's state.
-      key: consumed.
-      num_episodes: E.
-      deterministic: act by the mean instead of sampling.
+    Arguments as in `run_episodes`.
 
     Returns:
       EvalResult, fields [E].
     """
-    worlds, trajectory = run_episodes(
-        env, agent, agent_state, key, num_episodes, deterministic
-    )
-    valid = trajectory.valid
-    ep_cost = jnp.sum(valid * trajectory.cost_inputs.cost, axis=0)
-    whole = valid[-1]  # validity never comes back within an episode
-    violations = jnp.sum(whole * (ep_cost > 0))
-    return EvalResult(
-        ep_return=jnp.sum(valid * trajectory.reward, axis=0),
-        ep_cost=ep_cost,
-        distance_travelled=worlds.metrics["distance_travelled"].astype(valid.dtype),
-        valid=whole,
-        # An integer count: the floor only keeps 0 / 0 away.
-        violation_rate=violations / jnp.maximum(jnp.sum(whole), 1.0),
+    return score(
+        run_episodes(env, agent, agent_state, key, num_episodes, deterministic)
     )

@@ -21,7 +21,8 @@ from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
 from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import BANK, CostTerm
 from autocost_jax.envs.env import Env
-from autocost_jax.records import Key, Metrics, Slot, TrainingCost
+from autocost_jax.evaluate import Episodes, run_episodes, score
+from autocost_jax.records import EvalResult, Key, Metrics, Slot, TrainingCost
 from autocost_jax.train import Learner, init_learner, run_epoch
 
 AXIS = "slot"
@@ -128,6 +129,25 @@ def make_population(
         return _unpad(learners, sizes), metrics
 
     return Population(init, chunk, compile_, mesh.size)
+
+
+def make_evaluator(
+    env: Env, agent: Agent, num_episodes: int, deterministic: bool = False
+) -> Callable[[Any, Key], tuple[EvalResult, Episodes]]:
+    """Evaluate stacked policies in one compiled call.
+
+    All policies meet the same layouts. `agent` may be any algorithm whose `policy`
+    understands the states: PPO-Lagrangian's acts for CPO's, too.
+
+    Returns:
+      (agent states [P, ...], key) -> EvalResult [P, E] and Episodes [P, ...].
+    """
+
+    def evaluate_one(state: Any, key: Key) -> tuple[EvalResult, Episodes]:
+        episodes = run_episodes(env, agent, state, key, num_episodes, deterministic)
+        return score(episodes), episodes
+
+    return jax.jit(jax.vmap(evaluate_one, in_axes=(0, None)))
 
 
 def _init(agents: tuple[Agent, ...], slots: tuple[Slot, ...]) -> tuple[Learner, ...]:

@@ -116,6 +116,7 @@ class Display:
         self._is_live = self._console.is_terminal
         self._live: Any = None
         self._total, self._done = total_steps, done_steps
+        self._made = time.monotonic()
         self._start: float | None = None
         self._start_steps = done_steps
         self._rows: list[list[str]] = []
@@ -140,6 +141,15 @@ class Display:
     def start_clock(self) -> None:
         """Called when training starts, after the compile."""
         self._start = time.monotonic()
+
+    def skip(self, done_steps: int) -> None:
+        """Count steps that an earlier process has done."""
+        self._done = self._start_steps = done_steps
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the display was made."""
+        return time.monotonic() - self._made
 
     @property
     def steps_per_second(self) -> float:

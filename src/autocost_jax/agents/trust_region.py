@@ -46,7 +46,7 @@ def linearise(distribution: Distribution, theta: jax.Array) -> Linearised:
 
 
 def fisher_product(lin: Linearised, weight: jax.Array, damping: float) -> Product:
-    """z -> (F + damping I) z, with F the Hessian of the mean KL at the parameters.
+    """Products (F + damping I) z, with F the Hessian of the mean KL at the parameters.
 
         F z = J^T [w_r / std^2 * (J_mu z), 2 * (J_log_std z)],  sum_r w_r = 1
 

@@ -64,6 +64,9 @@ def make_world(config: EnvConfig) -> World:
     spec.option.disableflags |= int(
         mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     )
+    # The sparse factorisation is plain arithmetic; the dense one calls LAPACK or
+    # cuSOLVER once a world, which is slower for three degrees of freedom.
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     mj_model = spec.compile()
     model = mjx.put_model(mj_model, impl="jax")
     rest = mjx.make_data(mj_model, impl="jax")

@@ -1,4 +1,4 @@
-"""What a report is made of: plain records, and the evolved cost in NumPy."""
+"""What a report is made of: plain records, checked when they are made."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,12 +6,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-Array = np.ndarray[Any, Any]
+from autocost_jax.report_assets.cost_field import LIDAR_BINS, THETA_SIZE, Array
+
 BestLabel = Literal["zero violation, highest return", "lowest cost"]
 
-LIDAR_BINS = 8
-HIDDEN = 4
-THETA_SIZE = LIDAR_BINS * HIDDEN + HIDDEN + HIDDEN + 1
 TIMID_DISTANCE = 1.0  # metres an episode; an agent below it hardly moves
 
 
@@ -279,55 +277,3 @@ def finite_mean(values: Array) -> float:
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]
     return float(values.mean()) if values.size else float("nan")
-
-
-def object_lidar(ego_xy: Array) -> Array:
-    """The 8-bin exponential lidar (gain 1) of a single object.
-
-    Args:
-      ego_xy: [..., 2] the object's centre in the robot frame, metres.
-
-    Returns:
-      [..., 8] readings in [0, 1]; several objects combine by their maximum.
-
-    Source: openai/safety-gym engine.py, obs_lidar_pseudo, with aliasing.
-    """
-    x, y = np.moveaxis(np.asarray(ego_xy, float), -1, 0)
-    strength = np.exp(-np.hypot(x, y))
-    position = np.mod(np.arctan2(y, x), 2 * np.pi) / (2 * np.pi / LIDAR_BINS)
-    index = np.floor(position).astype(int)
-    alias = position - index
-    bins = np.arange(LIDAR_BINS)
-
-    def at(shift: int, value: Array) -> Array:
-        hit = (index[..., None] + shift) % LIDAR_BINS == bins
-        return np.where(hit, value[..., None], 0.0)
-
-    own, above, below = (
-        at(0, strength),
-        at(1, alias * strength),
-        at(-1, (1 - alias) * strength),
-    )
-    return np.maximum(own, np.maximum(above, below))
-
-
-def network_cost(theta: Array, lidar: Array) -> Array:
-    """The intrinsic cost in NumPy, independent of the JAX implementation.
-
-        c = sigmoid(W2 . sigmoid(W1 l + b1) + b2)
-
-    Args:
-      theta: [41] W1 row-major 8 x 4, b1, W2, b2.
-      lidar: [..., 8] readings in [0, 1].
-
-    Returns:
-      [...] cost in (0, 1).
-    """
-    theta = np.asarray(theta, float)
-    first, end = LIDAR_BINS * HIDDEN, LIDAR_BINS * HIDDEN + HIDDEN
-    hidden = lidar @ theta[:first].reshape(LIDAR_BINS, HIDDEN) + theta[first:end]
-    return _sigmoid(_sigmoid(hidden) @ theta[end:-1] + theta[-1])
-
-
-def _sigmoid(x: Array) -> Array:
-    return 0.5 * (1 + np.tanh(x / 2))  # does not overflow for steep networks

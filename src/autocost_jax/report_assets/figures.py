@@ -1,23 +1,16 @@
 """Figures of a search, drawn with matplotlib but without pyplot's global state.
 
 `stage_scatter`, `learning_curves` and `heat_map` return a `Figure` to save as PNG or
-PDF; `panels` returns the same drawings one by one, for the page.
+PDF; `*_panels` give the same drawings one by one, for the page.
 """
 
-import io
-import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from autocost_jax.report_assets.data import (
-    TIMID_DISTANCE,
-    Array,
-    ReportData,
-    network_cost,
-    object_lidar,
-)
+from autocost_jax.report_assets.cost_field import Array, network_cost, object_lidar
+from autocost_jax.report_assets.data import TIMID_DISTANCE, ReportData, finite_mean
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,13 +19,9 @@ if TYPE_CHECKING:
 INK, MUTED, GRID, PAPER = "#1c2430", "#5b6675", "#e3e7ec", "#fefefe"
 ZERO, BEST, MEAN, LIMIT = "#00815a", "#0b62a8", "#b84a06", "#b3261e"
 ALGORITHM_COLOURS = (BEST, MEAN, "#7a3f9d", "#4d5b1f")
-# on the page these become CSS variables, so that figures follow the dark mode
-CSS_VARIABLES = {
-    INK: "ink", MUTED: "muted", GRID: "grid", PAPER: "card", ZERO: "zero",
-    BEST: "best", MEAN: "mean", LIMIT: "limit", ALGORITHM_COLOURS[2]: "third",
-    ALGORITHM_COLOURS[3]: "fourth",
-}  # fmt: skip
 NAMES = {"ppo_lagrangian": "PPO-Lagrangian", "cpo": "CPO"}
+PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.3  # inches
+CURVE_POINTS = 60
 WIDE_COST = 20.0  # above it a cost axis is logarithmic beyond 1
 Draw = Callable[["Axes"], Any]
 
@@ -89,43 +78,15 @@ def heat_panels(theta: Array, hazard_radius: float) -> list[tuple[str, Draw]]:
     ]
 
 
-def panel_svg(draw: Draw, name: str, label: str) -> str:
-    """One panel as an inline `<svg>` that follows the page's colours.
-
-    Args:
-      draw: fills an `Axes`.
-      name: prefix of the ids, unique on the page.
-      label: text alternative, already escaped for an attribute.
-    """
-    import matplotlib
-
-    figure = _figure(4.6, 3.3)
-    draw(_axes(figure, 1, 1))
-    buffer = io.StringIO()
-    none = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        figure.savefig(buffer, format="svg", transparent=True, metadata=none)
-    svg = buffer.getvalue()
-    svg = svg[svg.index("<svg") :]
-    head, body = svg.split(">", 1)
-    view = re.search(r'viewBox="[^"]*"', head)
-    body = re.sub(r'\bid="', f'id="{name}-', body)
-    body = re.sub(r'href="#', f'href="#{name}-', body)
-    body = re.sub(r"url\(#", f"url(#{name}-", body)
-    body = re.sub(r"(font: [^;\"]*?px) [^;\"]*", r"\1 var(--sans)", body)
-    for colour, variable in CSS_VARIABLES.items():
-        body = body.replace(colour, f"var(--{variable})")
-    size = view.group(0) if view else ""
-    return f'<svg {size} role="img" aria-label="{label}">{body}'
-
-
-def _figure(width: float, height: float) -> "Figure":
+def make_figure(width: float, height: float) -> "Figure":
+    """An empty figure, in inches, that pyplot does not know."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=150, layout="constrained")
 
 
-def _axes(figure: "Figure", columns: int, number: int) -> "Axes":
+def add_axes(figure: "Figure", columns: int, number: int) -> "Axes":
+    """Axes in the report's style: cell `number`, from 1, of a row of `columns`."""
     axes = figure.add_subplot(1, columns, number)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(MUTED)
@@ -136,9 +97,9 @@ def _axes(figure: "Figure", columns: int, number: int) -> "Axes":
 
 
 def _row(draws: list[Draw]) -> "Figure":
-    figure = _figure(4.6 * len(draws), 3.4)
+    figure = make_figure(PANEL_WIDTH * len(draws), PANEL_HEIGHT)
     for number, draw in enumerate(draws, 1):
-        draw(_axes(figure, len(draws), number))
+        draw(add_axes(figure, len(draws), number))
     return figure
 
 
@@ -291,6 +252,16 @@ def _quartiles(values: Array) -> Array:
     return np.array(quartiles).reshape(-1, 3).T
 
 
+def _blocks(*series: Array) -> list[Array]:
+    """Means over blocks of epochs, so that a stage has at most `CURVE_POINTS`."""
+    size = -(-len(series[0]) // CURVE_POINTS)
+    starts = np.arange(0, len(series[0]), max(size, 1))
+    return [
+        np.array([finite_mean(values[i : i + size]) for i in starts])
+        for values in series
+    ]
+
+
 def _draw_curves(axes: "Axes", data: ReportData, field: str, label: str) -> None:
     stages = 1 + max((curve.stage for curve in data.curves), default=-1)
     length = np.zeros(stages + 1, int)
@@ -303,7 +274,7 @@ def _draw_curves(axes: "Axes", data: ReportData, field: str, label: str) -> None
         colour = ALGORITHM_COLOURS[kind % len(ALGORITHM_COLOURS)]
         name = NAMES.get(curve.algorithm, curve.algorithm).replace("$", r"\$")
         x = start[curve.stage] + 1 + np.arange(len(curve.epoch))
-        low, middle, high = _quartiles(getattr(curve, field))
+        x, low, middle, high = _blocks(x, *_quartiles(getattr(curve, field)))
         drawn += [low, high]
         axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
         first = name if name not in seen else None

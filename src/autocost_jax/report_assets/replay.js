@@ -17,7 +17,7 @@
     const worst = Math.max(1e-9, ...data.cost.map((c) => c || 0));
     const view = bounds();
     const still = matchMedia("(prefers-reduced-motion: reduce)");
-    let frame = 0, position = 0, playing = false, before = null, started = false, palette = colours();
+    let frame = 0, position = 0, clock = null, before = 0, started = false, drawing = false, palette = colours();
 
     function sums(values) {
       let sum = 0;
@@ -132,7 +132,7 @@
       frame = Math.min(last, Math.max(0, Math.floor(next)));
       world.dataset.frame = String(frame);
       if (Number(scrub.value) !== frame) scrub.value = String(frame);
-      scrub.setAttribute("aria-valuetext", (frame + 1) * data.dt >= 0 ? seconds(frame) : "");
+      scrub.setAttribute("aria-valuetext", "step " + (frame + 1) + ", " + seconds(frame));
       const number = (value, digits) => (value === null ? "–" : value.toFixed(digits));
       byId("now-step").textContent = frame + 1 + " of " + steps;
       byId("now-time").textContent = seconds(frame);
@@ -143,28 +143,31 @@
       byId("now-step-intrinsic").textContent = number(data.intrinsic[frame], 4);
       byId("now-goals").textContent = String(goals[frame]);
       byId("now-cost").classList.toggle("hit", total.cost[frame] > 0);
-      drawWorld(); drawTimeline();
+      if (!drawing) requestAnimationFrame(() => { drawing = false; drawWorld(); drawTimeline(); });
+      drawing = true;
     }
 
     function seconds(t) { return ((t + 1) * data.dt).toFixed(1) + " s"; }
 
-    function tick(now) {
-      if (!playing) return;
-      if (before !== null) position += ((now - before) / 1000 / data.dt) * Number(speed.value);
+    // A timer moves the episode on, whatever the frame rate; drawing waits for a frame.
+    function tick() {
+      const now = performance.now();
+      position += (Math.min(now - before, 200) / 1000 / data.dt) * Number(speed.value);
       before = now;
       show(position);
-      if (frame >= last) { setPlaying(false); return; }
-      requestAnimationFrame(tick);
+      if (frame >= last) setPlaying(false);
     }
 
     function setPlaying(on) {
       if (on && frame >= last) position = 0;
-      playing = on; started = true; before = null;
+      clearInterval(clock);
+      before = performance.now();
+      clock = on ? setInterval(tick, 1000 / 60) : null;
+      started = true;
       button.textContent = on ? "Pause" : "Play";
-      if (on) requestAnimationFrame(tick);
     }
 
-    button.addEventListener("click", () => setPlaying(!playing));
+    button.addEventListener("click", () => setPlaying(clock === null));
     scrub.addEventListener("input", () => { position = Number(scrub.value); started = true; show(position); });
     timeline.addEventListener("click", (event) => { position = (event.offsetX / timeline.clientWidth) * last; started = true; show(position); });
     window.addEventListener("resize", () => show(frame));
@@ -173,5 +176,6 @@
       if (entries.some((entry) => entry.isIntersecting) && !started && !still.matches) setPlaying(true);
     }, { threshold: 0.4 }).observe(world);
     show(0);
+    if (location.hash === "#replay") setPlaying(true); // a link that starts the replay
   }
 })();

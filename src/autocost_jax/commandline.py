@@ -1,0 +1,87 @@
+"""What the command lines share: flags from dataclasses, devices, one-line errors."""
+
+import contextlib
+import io
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+BAD_INPUT = 2
+
+
+def parse(kind: type[T], argv: Sequence[str], prog: str, **options: Any) -> T:
+    """Flags of a dataclass by tyro; a bad one ends the program in one line, status 2."""
+    import tyro
+
+    panel = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(panel):
+            return tyro.cli(kind, args=list(argv), prog=prog, **options)
+    except SystemExit as stop:
+        if stop.code not in (0, None):
+            fail(f"{prog}: {_first_sentence(panel.getvalue())} (see {prog} --help)")
+        sys.stderr.write(panel.getvalue())
+        raise
+
+
+def _first_sentence(panel: str) -> str:
+    """The message of tyro's error panel without its frame, on one line."""
+    lines = [re.sub(r"[│╭╮╰╯─]+", " ", line).strip() for line in panel.splitlines()]
+    text = " ".join(line for line in lines if line)
+    text = re.sub(r"^(Parsing error|Unrecognized options|Missing required)\s+", "", text)
+    return re.split(r"\s+(?:For full helptext|Arguments similar)", text)[0].strip()
+
+
+def fail(message: str, status: int = BAD_INPUT) -> None:
+    """End the program with one line on stderr."""
+    sys.stderr.write(" ".join(message.split()) + "\n")
+    raise SystemExit(status)
+
+
+def guarded(main: Callable[[], None], prog: str) -> None:
+    """Run a command; expected errors become one line and an exit status.
+
+    Bad input is status 2, a run that could not go on is 1, Ctrl-C is 130.
+    """
+    from autocost_jax.arrays import DiskFullError
+
+    try:
+        main()
+    except ValueError as error:
+        fail(f"{prog}: {error}")
+    except (DiskFullError, RuntimeError) as error:
+        fail(f"{prog}: {error}", status=1)
+    except KeyboardInterrupt:
+        fail(f"{prog}: interrupted; continue with --resume", status=130)
+
+
+def quiet() -> None:
+    """Keep start-up chatter of libraries (optional parts not installed) away."""
+    logging.getLogger("absl").setLevel(logging.ERROR)
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+
+def use_devices(count: int | None) -> Sequence[Any]:
+    """The devices a run uses; on a CPU one for each core unless told otherwise.
+
+    Must be called before anything of JAX has run: a CPU is split into devices then.
+
+    Args:
+      count: number of devices, None for all.
+
+    Raises:
+      ValueError: if there are fewer.
+    """
+    import jax
+
+    cores = os.cpu_count() or 1
+    with contextlib.suppress(RuntimeError):  # too late to split: take what is there
+        jax.config.update("jax_num_cpu_devices", max(count or cores, 1))
+    devices = jax.devices()
+    if count is not None and not 1 <= count <= len(devices):
+        raise ValueError(f"devices must be in [1, {len(devices)}], got {count}")
+    return devices[:count]

@@ -1,0 +1,145 @@
+"""The main job: `python -m autocost_jax.evolve`.
+
+Evolves intrinsic costs until agents stop violating the constraint. Everything about
+the run lands in one directory: configuration, metrics, TensorBoard events,
+checkpoints, the best cost and an HTML report.
+"""
+
+import dataclasses
+import functools
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Literal
+
+from autocost_jax.commandline import fail, guarded, parse, quiet, use_devices
+from autocost_jax.config import PRESETS, SearchConfig, preset
+from autocost_jax.envs.env import list_envs, make_env
+from autocost_jax.evolution import evolve, search
+
+__all__ = ["evolve", "main", "search"]
+PROG = "python -m autocost_jax.evolve"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line; `argv` defaults to the program's."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    quiet()
+    guarded(lambda: _main(argv), PROG)
+
+
+def _main(argv: list[str]) -> None:
+    defaults = _defaults(argv)
+    options = parse(_options_type(), argv, PROG, default=defaults, description=__doc__)
+    config = options.search
+    if options.env is not None:
+        env = make_env(options.env).config  # unknown: lists the valid ones
+        names = {"task": env.task, "constraint": env.constraint, "robot": env.robot}
+        env = dataclasses.replace(config.train.env, **names)
+        config = dataclasses.replace(
+            config, train=dataclasses.replace(config.train, env=env)
+        )
+    from autocost_jax.run import describe, run_search
+
+    path = options.out or Path("runs") / f"{options.preset}-seed{config.seed}"
+    devices = use_devices(options.devices)
+    if options.dry_run:
+        print("\n".join([*describe(config, len(devices)), f"would write to {path}"]))
+        return
+    run_search(
+        config,
+        path,
+        resume=options.resume,
+        overwrite=options.overwrite,
+        devices=devices,
+        num_episodes=options.eval_episodes,
+    )
+
+
+@functools.cache
+def _options_type() -> Any:
+    """The flags; made here because tyro is imported only when it is used."""
+    import tyro
+
+    @dataclass(frozen=True)
+    class Options:
+        """Flags of the search.
+
+        Attributes:
+          preset: laptop: 2 CPU cores, under 10 minutes; search: one GPU; paper: the
+            paper's hyper-parameters; smoke: a test of the installation. The other
+            flags default to the preset's values.
+          config: run directory whose config.yaml replaces the preset's values.
+          env: environment, such as Goal-Hazard-Point.
+          out: run directory; default runs/PRESET-seedN.
+          resume: continue the run in `out` from its newest checkpoint.
+          overwrite: start over in a directory that already holds a run.
+          devices: devices to use; default: all; a CPU counts one a core.
+          dry_run: say what would be done, and stop.
+          eval_episodes: fresh episodes in which the best cost's agents are scored.
+          search: the search's settings.
+        """
+
+        preset: Literal["laptop", "search", "paper", "smoke"] = "laptop"
+        config: Path | None = None
+        env: str | None = None
+        out: Path | None = None
+        resume: bool = False
+        overwrite: bool = False
+        devices: int | None = None
+        dry_run: bool = False
+        eval_episodes: int = 100
+        search: Annotated[SearchConfig, tyro.conf.OmitArgPrefixes] = field(
+            default_factory=SearchConfig
+        )
+
+    return Options
+
+
+def _defaults(argv: list[str]) -> Any:
+    """Options with the values of a preset or of a run; on --resume of that run."""
+    name = _flag(argv, "--preset") or "laptop"
+    if name not in PRESETS:
+        fail(f"{PROG}: unknown preset {name!r}; presets: {', '.join(PRESETS)}")
+    config = preset(name)
+    out, source = _flag(argv, "--out"), _flag(argv, "--config")
+    if source is None and "--resume" in argv and _flag(argv, "--preset") is None:
+        source = out
+    if source is not None:
+        from autocost_jax.store import read_config
+
+        config, _ = read_config(Path(source))
+    env = _flag(argv, "--env")
+    if env is not None and env not in list_envs():
+        make_env(env)
+    return _options_type()(preset=name, search=config)
+
+
+def _flag(argv: list[str], name: str) -> str | None:
+    """The value of a flag, before the flags are parsed."""
+    for index, word in enumerate(argv):
+        if word == name and index + 1 < len(argv):
+            return argv[index + 1]
+        if word.startswith(f"{name}="):
+            return word.partition("=")[2]
+    return None
+
+
+class _CallableModule(ModuleType):
+    """Lets `autocost_jax.evolve` be the function and the module of `python -m`.
+
+    Importing a module binds its name in the package, and this one has the name of the
+    package's most used function.
+    """
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """See `autocost_jax.evolution.evolve`."""
+        return evolve(*args, **kwargs)
+
+
+sys.modules[__name__].__class__ = _CallableModule
+
+if __name__ == "__main__":
+    main()

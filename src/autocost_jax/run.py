@@ -1,0 +1,359 @@
+"""One search in a run directory: watched, checkpointed, resumed, reported."""
+
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from autocost_jax.arrays import flatten, load_arrays, unflatten
+from autocost_jax.config import SearchConfig
+from autocost_jax.envs.env import make_env
+from autocost_jax.evolution import (
+    Progress,
+    Searcher,
+    SearchState,
+    best_of,
+    evolve,
+    init_search,
+    make_searcher,
+    stage_slots,
+)
+from autocost_jax.population import make_agents, make_evaluator
+from autocost_jax.progress import Display, format_seconds, summarise
+from autocost_jax.records import EvalResult
+from autocost_jax.store import RunDir, check_free_space, estimate_bytes
+
+EVALUATION = 2**31 - 1  # purpose of the final evaluation's key, beyond any stage
+
+
+def estimate_memory(config: SearchConfig, num_devices: int) -> int:
+    """Bytes the largest arrays of the program need on each device, roughly.
+
+    The trajectory of all slots, twice (the rollout writes it time-first, the updates
+    read it slot-first), and four copies of parameters and optimiser moments.
+    """
+    env = make_env(config.train.env)
+    slots = config.population_size * len(config.algorithms)
+    row = env.observation_size + 2 * env.action_size + 24
+    rows = config.train.num_worlds * env.episode_length
+    sizes = (env.observation_size, *config.train.agent.hidden_sizes, env.action_size)
+    weights = sum(a * b for a, b in zip(sizes[:-1], sizes[1:], strict=True))
+    width = max(config.train.agent.hidden_sizes)
+    batch = rows // config.train.agent.value_minibatches
+    activations = 4 * batch * width * len(config.train.agent.hidden_sizes)
+    per_slot = 2 * row * rows + activations + 4 * 3 * 3 * weights
+    return 4 * per_slot * -(-slots // num_devices)
+
+
+def describe(config: SearchConfig, num_devices: int) -> list[str]:
+    """What a run will do, as lines for people."""
+    train, agent = config.train, config.train.agent
+    algorithms = " + ".join(config.algorithms)
+    worlds = f"{train.num_worlds} worlds x {train.env.num_steps} steps"
+    sizes = "-".join(str(size) for size in agent.hidden_sizes)
+    return [
+        f"{train.env.name}: {config.num_stages} stages of {config.population_size} "
+        f"candidates ({config.num_elites} elites), each trained by {algorithms}",
+        f"{train.num_epochs} epochs of {worlds} a slot, nets {sizes}, policy "
+        f"{agent.policy_passes} x {agent.policy_minibatches} and critic "
+        f"{agent.value_passes} x {agent.value_minibatches} steps an epoch",
+        f"{config.env_steps:,} env steps in all; on {num_devices} device(s) of kind "
+        f"{jax.devices()[0].device_kind}; about "
+        f"{estimate_memory(config, num_devices) / 1e9:.2f} GB of memory on each",
+    ]
+
+
+def check_memory(config: SearchConfig, devices: Sequence[jax.Device]) -> None:
+    """Refuse a run whose arrays cannot fit on its devices.
+
+    Raises:
+      ValueError: with the estimate and what the device has, if it tells.
+    """
+    stats = devices[0].memory_stats() or {}
+    limit = stats.get("bytes_limit")
+    need = estimate_memory(config, len(devices))
+    if limit is not None and need > limit:
+        raise ValueError(
+            f"the run needs about {need / 1e9:.1f} GB on each device, which has "
+            f"{limit / 1e9:.1f} GB: lower population_size or num_worlds, or use more "
+            "devices"
+        )
+
+
+def run_search(
+    config: SearchConfig,
+    path: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    devices: Sequence[jax.Device] | None = None,
+    num_episodes: int = 100,
+) -> Path:
+    """Run or resume a search and leave everything about it in a run directory.
+
+    Args:
+      config: the search; on resume it must be the run's own.
+      path: the run directory.
+      resume: continue from the newest whole checkpoint.
+      overwrite: start over in a directory that already holds a run.
+      devices: default: the first one.
+      num_episodes: episodes of the final evaluation of the best candidate's agents.
+
+    Returns:
+      The path of the report.
+
+    Raises:
+      RunDirError: the directory is not usable for this run.
+      DiskFullError: the disk is full; the directory is intact.
+      ValueError: the configuration does not fit the devices.
+      RuntimeError: every candidate of a stage failed.
+    """
+    devices = list(devices or jax.devices()[:1])
+    check_memory(config, devices)
+    if resume:
+        run = RunDir.open(path, config)
+    else:
+        run = RunDir.create(path, config, overwrite=overwrite)
+    total = config.env_steps
+    with run, Display(total, 0, sys.stdout) as display:
+        for line in [*run.warnings, *describe(config, len(devices))]:
+            display.say(line)
+        searcher = make_searcher(config, devices)
+        state = _start(run, searcher, display, resume)
+        if int(state.stage) < config.num_stages:
+            _compile(searcher, state, display)
+        state = _train(run, searcher, state, display)
+        return _finish(run, searcher, state, display, num_episodes)
+
+
+def _start(
+    run: RunDir, searcher: Searcher, display: Display, resume: bool
+) -> SearchState:
+    state = init_search(searcher)
+    check_free_space(run.path, 4 * estimate_bytes(state))
+    step = None
+    if resume:
+        checkpoint = run.resume(state)
+        if checkpoint is None:
+            display.say(f"{run.path} has no checkpoint yet: starting again")
+        else:
+            state, step = checkpoint.tree, checkpoint.step
+            for line in checkpoint.warnings:
+                display.say(line)
+            done = f"{int(state.stage)} stages and {int(state.epoch)} epochs"
+            display.say(f"resuming {run.path} after {done}")
+            display.skip(_steps_done(run.config, state))
+    hint = run.start_tensorboard(purge_step=step)
+    if hint:
+        display.say(hint)
+    return state
+
+
+def _compile(searcher: Searcher, state: SearchState, display: Display) -> None:
+    display.say("compiling the population program ...")
+    start = time.monotonic()
+    slots = stage_slots(
+        searcher.config, searcher.root, int(state.stage), state.candidates
+    )
+    searcher.population.compile(state.learners, slots)
+    display.say(f"compiled in {time.monotonic() - start:.1f} s")
+
+
+def _steps_done(config: SearchConfig, state: SearchState) -> int:
+    epochs = int(state.stage) * config.train.num_epochs
+    if int(state.stage) < config.num_stages:
+        epochs += int(state.epoch)
+    return epochs * config.env_steps // (config.num_stages * config.train.num_epochs)
+
+
+def _train(
+    run: RunDir, searcher: Searcher, state: SearchState, display: Display
+) -> SearchState:
+    config = run.config
+    chunk = config.train.chunk_epochs
+    chunk_steps = config.env_steps // (config.num_stages * config.train.num_epochs)
+    display.start_clock()
+    for state, progress in evolve(config, state=state, searcher=searcher):
+        first = progress.stage * config.train.num_epochs + progress.epoch
+        display.update(
+            summarise(
+                progress.stage,
+                config.num_stages,
+                progress.epoch + chunk,
+                config.train.num_epochs,
+                progress.metrics,
+            ),
+            chunk_steps * chunk,
+        )
+        for k in range(chunk):
+            row: dict[str, Any] = {"stage": progress.stage, "epoch": progress.epoch + k}
+            for name, group in zip(config.algorithms, progress.metrics, strict=True):
+                row |= {f"{name}/{key}": value[k] for key, value in group.items()}
+            row["time/env_steps_per_second"] = display.steps_per_second
+            run.log_metrics(row, first + k)
+        if progress.result is not None:
+            _write_stage(run, searcher, state, progress)
+        position = {"stage": int(state.stage), "epoch": int(state.epoch)}
+        run.save_checkpoint(state, first + chunk, position)
+    return state
+
+
+def _write_stage(
+    run: RunDir, searcher: Searcher, state: SearchState, progress: Progress
+) -> None:
+    """The stage's npz and the policies of its best candidate."""
+    result, config = progress.result, run.config
+    assert result is not None
+    scores = {f"scores/{key}": value for key, value in result.scores.items()}
+    arrays = {
+        "theta": result.candidates,
+        "cost": result.fitness.cost,
+        "ep_return": result.fitness.ep_return,
+        "order": result.order,
+        "frozen": result.frozen,
+        "elites": state.es.elites,
+        "archive": state.es.archive,
+        "archive_cost": state.es.archive_fitness.cost,
+        "archive_return": state.es.archive_fitness.ep_return,
+        "key": jax.random.key_data(searcher.root),
+        **scores,
+    }
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    run.write_stage(progress.stage, arrays)
+    top = int(result.order[0])
+    for name, learner in zip(config.algorithms, result.learners, strict=True):
+        params = jax.tree.map(lambda leaf: leaf[top], learner.agent.policy)
+        run.write_policy(policy_name(progress.stage, name), flatten(params))
+
+
+def policy_name(stage: int, algorithm: str) -> str:
+    """File stem of the policy of a stage's best candidate."""
+    return f"stage_{stage:02d}_{algorithm}"
+
+
+def load_policies(config: SearchConfig, files: Sequence[Path]) -> tuple[Any, Any]:
+    """Saved policies as one stacked agent state, and the agent that acts for it.
+
+    Args:
+      config: the run's configuration, for the shapes.
+      files: policies/*.npz.
+
+    Returns:
+      Agent, and its state with the policies stacked [P, ...].
+
+    Raises:
+      RunDirError: a file is missing or is not such a policy.
+    """
+    env = make_env(config.train.env)
+    (agent,) = make_agents(config.algorithms[:1], config.train, env)
+    template = agent.init(jax.random.key(0))
+    loaded = [unflatten(load_arrays(file, None), template.policy) for file in files]
+    stacked = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (len(loaded), *leaf.shape)), template
+    )
+    policy = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loaded)
+    return agent, dataclasses.replace(stacked, policy=policy)
+
+
+def _finish(
+    run: RunDir,
+    searcher: Searcher,
+    state: SearchState,
+    display: Display,
+    num_episodes: int,
+) -> Path:
+    """Name the best cost, evaluate its agents on fresh layouts, write the report."""
+    from autocost_jax.report import write_report
+    from autocost_jax.summary import load_report
+
+    config = run.config
+    best = best_of(config, state.es)
+    stage = int(best.generation)
+    display.say(f"evaluating the best cost over {num_episodes} fresh episodes ...")
+    files = [
+        run.path / "policies" / f"{policy_name(stage, name)}.npz"
+        for name in config.algorithms
+    ]
+    agent, states = load_policies(config, files)
+    env = make_env(config.train.env)
+    key = jax.random.fold_in(searcher.root, EVALUATION)
+    results, episodes = make_evaluator(env, agent, num_episodes)(states, key)
+    is_zero = bool(best.zero_violation)
+    card = {
+        "label": "zero violation, highest return" if is_zero else "lowest cost",
+        "environment": config.train.env.name,
+        "stage": stage,
+        "index": int(best.index),
+        "search_cost": float(best.cost),
+        "search_return": float(best.ep_return),
+        "env_steps": config.env_steps,
+        "seed": config.seed,
+        "evaluation": {
+            name: eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
+            for i, name in enumerate(config.algorithms)
+        },
+    }
+    run.write_cost({"theta": np.asarray(best.candidate)}, card)
+    first = jax.tree.map(lambda leaf: np.asarray(leaf[0]), episodes)
+    run.write_arrays("replay", _replay_arrays(first))
+    report = write_report(load_report(run.path), run.path / "report" / "index.html")
+    for line in finish_lines(card, report, display.elapsed):
+        display.say(line)
+    return report
+
+
+def finish_lines(card: dict[str, Any], report: Path, elapsed: float) -> list[str]:
+    """What a finished run says last."""
+    lines = [
+        f"best cost: stage {card['stage'] + 1}, candidate {card['index']} "
+        f"({card['label']})"
+    ]
+    for name, row in card["evaluation"].items():
+        lines.append(
+            f"  {name}: return {row['return_mean']:.2f} +- {row['return_ci']:.2f}, "
+            f"extrinsic cost {row['cost_mean']:.3f} +- {row['cost_ci']:.3f}, "
+            f"violating episodes {row['violation_rate']:.1%} of {row['episodes']}"
+        )
+    return [*lines, f"done in {format_seconds(elapsed)}; open {report}"]
+
+
+def eval_summary(result: EvalResult) -> dict[str, float | int]:
+    """Means with normal 95 % intervals over the valid episodes of one policy."""
+    valid = np.asarray(result.valid) > 0
+    count = int(valid.sum())
+
+    def interval(values: jax.Array) -> tuple[float, float]:
+        kept = np.asarray(values, np.float64)[valid]
+        if count < 2:
+            return float(kept.mean()) if count else float("nan"), float("nan")
+        return float(kept.mean()), float(1.96 * kept.std(ddof=1) / np.sqrt(count))
+
+    ep_return, ep_cost = interval(result.ep_return), interval(result.ep_cost)
+    return {
+        "return_mean": ep_return[0],
+        "return_ci": ep_return[1],
+        "cost_mean": ep_cost[0],
+        "cost_ci": ep_cost[1],
+        "violation_rate": float(result.violation_rate),
+        "distance_travelled": interval(result.distance_travelled)[0],
+        "episodes": count,
+    }
+
+
+def _replay_arrays(episodes: Any) -> dict[str, np.ndarray]:
+    """The first of one policy's episodes, as the report's replay needs it."""
+    return {
+        "robot_xy": episodes.robot_xy[:, 0],
+        "robot_yaw": episodes.robot_yaw[:, 0],
+        "goal_xy": episodes.goal_xy[:, 0],
+        "hazards": episodes.start.hazards[0],
+        "reward": episodes.reward[:, 0],
+        "cost": episodes.cost_inputs.cost[:, 0],
+        "constraint_lidar": episodes.cost_inputs.constraint_lidar[:, 0],
+    }

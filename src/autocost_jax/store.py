@@ -1,0 +1,385 @@
+"""The run directory: its configuration, metrics, checkpoints and artifacts.
+
+    config.yaml       the resolved configuration and the facts of the run
+    metrics.jsonl     one strict JSON object a line; TensorBoard events in tensorboard/
+    checkpoints/      the last three, see `checkpoints`
+    stage_NN.npz      what a finished stage left
+    cost.npz, .json   the best cost and its card
+    policies/*.npz    flat parameters
+    lock              held while a run writes here
+
+This module is the only writer of a run directory. JSON knows no non-finite numbers:
+in metrics.jsonl and cost.json they are the strings "NaN", "Infinity" and "-Infinity".
+"""
+
+import fcntl
+import json
+import os
+import socket
+from collections.abc import Mapping
+from io import FileIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from autocost_jax import checkpoints
+from autocost_jax.arrays import (
+    TEMPORARY,
+    ArraySpec,
+    DiskFullError,
+    RunDirError,
+    check_free_space,
+    disk_errors,
+    load_arrays,
+    remove,
+    remove_temporaries,
+    save_arrays,
+    write_atomic,
+)
+from autocost_jax.checkpoints import Checkpoint, estimate_bytes
+from autocost_jax.config import SearchConfig
+from autocost_jax.rundata import (
+    CONFIG,
+    FORMAT,
+    METRICS,
+    changed_facts,
+    config_hash,
+    first_difference,
+    from_dict,
+    list_stages,
+    read_config,
+    read_document,
+    read_metrics,
+    run_facts,
+    to_dict,
+    to_json,
+)
+
+__all__ = [
+    "ArraySpec",
+    "Checkpoint",
+    "DiskFullError",
+    "RunDir",
+    "RunDirError",
+    "check_free_space",
+    "config_hash",
+    "estimate_bytes",
+    "from_dict",
+    "list_stages",
+    "load_arrays",
+    "read_config",
+    "read_metrics",
+    "run_facts",
+    "save_arrays",
+    "to_dict",
+    "write_atomic",
+]
+
+
+class RunDir:
+    """A run directory that this process may write to, until it is closed.
+
+    Make one with `RunDir.create` or `RunDir.open` and use it in a `with` statement.
+    With several processes only the first may have one.
+
+    Attributes:
+      path: the directory.
+      config: the run's configuration.
+      facts: the facts recorded at its start.
+      warnings: lines the user should see, from opening it.
+    """
+
+    def __init__(self, path: Path, config: Any, facts: dict, lock: int) -> None:
+        self.path = path
+        self.config = config
+        self.facts = facts
+        self.warnings: list[str] = []
+        self._hash = config_hash(config)
+        self._lock = lock
+        self._metrics: FileIO | None = None
+        self._events: Any = None
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        config: Any,
+        facts: dict[str, Any] | None = None,
+        overwrite: bool = False,
+    ) -> Self:
+        """Start a run in a new or empty directory, or in place of an earlier run.
+
+        Args:
+          path: made with its parents if it does not exist.
+          config: the resolved configuration, a frozen dataclass.
+          facts: see `run_facts`; None collects them.
+          overwrite: delete the files of the run that is there; never anything else.
+
+        Raises:
+          RunDirError: the directory holds a run or something else, or is in use.
+        """
+        import yaml
+
+        path = Path(path)
+        facts = run_facts(getattr(config, "seed", None)) if facts is None else facts
+        document = {"format": FORMAT, "config": to_dict(config), "facts": facts}
+        text = yaml.safe_dump(document, sort_keys=False)
+        _check_new(path, overwrite)
+        lock = _lock(path)
+        try:
+            _check_new(path, overwrite)  # again: another process may have been faster
+            for old in _run_files(path):
+                remove(old)
+            write_atomic(path / CONFIG, text.encode())
+        except BaseException:
+            os.close(lock)
+            raise
+        return cls(path, config, facts, lock)
+
+    @classmethod
+    def open(cls, path: str | Path, config: Any = None) -> Self:
+        """Open a run to go on with it.
+
+        Args:
+          path: the directory.
+          config: what the user asks for now; None takes the run's own.
+
+        Raises:
+          RunDirError: not a run, in use, or `config` is not the run's: the first
+            field that differs is named with both values.
+        """
+        path = Path(path)
+        kind = SearchConfig if config is None else type(config)
+        recorded, facts = read_config(path, kind)
+        difference = first_difference(recorded, config or recorded)
+        if difference is not None:
+            name, old, new = difference
+            raise RunDirError(
+                f"{path} was started with {name}={old}, asked for {name}={new}: "
+                "resume with the run's own configuration, or start a new run"
+            )
+        run = cls(path, recorded, facts, _lock(path))
+        for folder in (path, path / "checkpoints", path / "policies"):
+            remove_temporaries(folder)
+        changed = changed_facts(facts, run_facts())
+        if changed:
+            run.warnings.append(
+                f"{path} was started with other versions, so results may"
+                f" differ: {changed}"
+            )
+        return run
+
+    def close(self) -> None:
+        """Flush everything and let other processes in."""
+        if self._lock < 0:
+            return
+        try:
+            self._sync_metrics()
+            if self._metrics is not None:
+                self._metrics.close()
+            if self._events is not None:
+                self._events.close()
+        finally:
+            os.close(self._lock)
+            self._lock = -1
+
+    def __enter__(self) -> Self:
+        """Return the run itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the run."""
+        self.close()
+
+    def start_tensorboard(self, purge_step: int | None = None) -> str | None:
+        """Write TensorBoard events too, from now on.
+
+        Args:
+          purge_step: on resume the first step that is done again; TensorBoard hides
+            earlier events from there on.
+
+        Returns:
+          None, or a hint for the user if tensorboardX is not installed.
+        """
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError:
+            return "no TensorBoard events: pip install tensorboardX"
+        folder = str(self.path / "tensorboard")
+        self._events = SummaryWriter(folder, purge_step=purge_step)
+        return None
+
+    def log_metrics(self, row: Mapping[str, Any], step: int) -> None:
+        """Append a row to metrics.jsonl, and its means to TensorBoard.
+
+        Args:
+          row: numbers, strings, arrays, and lists or dicts of them; "step" is added.
+          step: place of the row on TensorBoard's axis.
+        """
+        line = json.dumps(to_json({"step": step, **row}), allow_nan=False)
+        with disk_errors(self.path / METRICS):
+            if self._metrics is None:
+                # Unbuffered: what a full disk refused must not come back in close().
+                self._metrics = (self.path / METRICS).open("ab", buffering=0)
+            _append(self._metrics, line.encode() + b"\n")
+            if self._events is None:
+                return
+            for name, value in row.items():
+                array = np.asarray(value)
+                if array.dtype.kind in "biuf" and array.size:
+                    self._events.add_scalar(name, float(array.mean()), step)
+
+    def save_checkpoint(
+        self, tree: Any, step: int, extra: dict[str, Any] | None = None
+    ) -> Path:
+        """Write a checkpoint that also marks where metrics.jsonl ends now.
+
+        Write the artifacts of a finished stage before it: what a checkpoint has
+        passed is not done again.
+
+        Args:
+          tree: pytree of jax or numpy arrays, typed keys included.
+          step: grows from one checkpoint to the next.
+          extra: strict JSON facts such as stage and epoch, given back by `resume`.
+
+        Raises:
+          DiskFullError: the disk is full; earlier checkpoints are intact.
+        """
+        metrics_bytes = self._sync_metrics()
+        return checkpoints.save(
+            self.path / "checkpoints",
+            tree,
+            step,
+            config_hash=self._hash,
+            metrics_bytes=metrics_bytes,
+            extra=extra or {},
+        )
+
+    def resume(self, template: Any) -> Checkpoint | None:
+        """Load the newest whole checkpoint and cut the metrics back to it.
+
+        Args:
+          template: pytree of arrays or `jax.ShapeDtypeStruct`s, as was saved.
+
+        Returns:
+          The checkpoint, whose `warnings` the user should see, or None if the run
+          ended before the first one and starts again.
+
+        Raises:
+          RunDirError: all checkpoints are broken, or the template does not fit.
+        """
+        folder = self.path / "checkpoints"
+        checkpoint = checkpoints.load_latest(folder, template, self._hash)
+        warning = self.truncate_metrics(checkpoint.metrics_bytes if checkpoint else 0)
+        if checkpoint is not None and warning is not None:
+            checkpoint.warnings.append(warning)
+        return checkpoint
+
+    def truncate_metrics(self, metrics_bytes: int) -> str | None:
+        """Cut metrics.jsonl to a length; returns a warning if it was shorter."""
+        file = self.path / METRICS
+        if self._metrics is not None:
+            self._metrics.close()
+            self._metrics = None
+        length = file.stat().st_size if file.exists() else 0
+        if length < metrics_bytes:
+            return f"{file} lost {metrics_bytes - length} bytes since the checkpoint"
+        if length > metrics_bytes:
+            os.truncate(file, metrics_bytes)
+        return None
+
+    def write_stage(self, stage: int, arrays: Mapping[str, Any]) -> Path:
+        """Write stage_NN.npz."""
+        file = self.path / f"stage_{stage:02d}.npz"
+        save_arrays(file, arrays)
+        return file
+
+    def write_cost(self, arrays: Mapping[str, Any], card: Mapping[str, Any]) -> Path:
+        """Write cost.npz and its card, cost.json."""
+        save_arrays(self.path / "cost.npz", arrays)
+        text = json.dumps(to_json(card), indent=2, allow_nan=False)
+        write_atomic(self.path / "cost.json", text.encode() + b"\n")
+        return self.path / "cost.npz"
+
+    def write_policy(self, name: str, params: Any) -> Path:
+        """Write policies/NAME.npz, the parameters as `arrays.flatten` names them."""
+        file = self.path / "policies" / f"{name}.npz"
+        save_arrays(file, params)
+        return file
+
+    def write_arrays(self, name: str, arrays: Mapping[str, Any]) -> Path:
+        """Write NAME.npz."""
+        save_arrays(self.path / f"{name}.npz", arrays)
+        return self.path / f"{name}.npz"
+
+    def _sync_metrics(self) -> int:
+        file = self.path / METRICS
+        with disk_errors(file):
+            if self._events is not None:
+                self._events.flush()
+            if self._metrics is not None:
+                os.fsync(self._metrics.fileno())
+            return file.stat().st_size if file.exists() else 0
+
+
+def _run_files(path: Path) -> list[Path]:
+    """What a run owns in its directory, but for its config and its lock."""
+    names = (METRICS, "tensorboard", "checkpoints", "policies", "report")
+    patterns = (*names, "stage_*.npz", "cost.npz", "cost.json", f"{TEMPORARY}*")
+    return [file for pattern in patterns for file in path.glob(pattern)]
+
+
+def _append(file: FileIO, line: bytes) -> None:
+    """Append all of a line or, if that fails, nothing."""
+    length = os.fstat(file.fileno()).st_size
+    try:
+        while line:
+            line = line[file.write(line) :]
+    except OSError:
+        file.truncate(length)
+        raise
+
+
+def _check_new(path: Path, overwrite: bool) -> None:
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise RunDirError(f"{path} is a file, not a directory")
+    names = {file.name for file in path.iterdir()} - {"lock"}
+    if CONFIG in names and not overwrite:
+        raise RunDirError(
+            f"{path} already holds a run: resume it, or choose another directory"
+        )
+    if CONFIG in names:
+        read_document(path)  # raises unless it is a run
+    elif any(not name.startswith(TEMPORARY) for name in names):
+        raise RunDirError(
+            f"{path} is not empty and not a run: choose another directory"
+        )
+
+
+def _lock(path: Path) -> int:
+    """Take the lock of a directory, made if need be; the kernel frees it on a kill."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise RunDirError(f"{path} cannot be written: {error.strerror}") from None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, f"pid {os.getpid()} on {socket.gethostname()}".encode(), 0)
+    except OSError as error:
+        holder = os.pread(handle, 200, 0).decode(errors="replace")
+        os.close(handle)
+        if isinstance(error, BlockingIOError):
+            raise RunDirError(f"{path} is in use by {holder or 'a process'}") from None
+        raise RunDirError(f"{path} cannot be locked: {error.strerror}") from None
+    return handle

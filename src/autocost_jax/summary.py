@@ -1,0 +1,178 @@
+"""From a run directory to the data of its report."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from autocost_jax.arrays import RunDirError, load_arrays
+from autocost_jax.config import SearchConfig
+from autocost_jax.envs.env import make_env
+from autocost_jax.report import (
+    BestCandidate,
+    Curve,
+    Evaluation,
+    Replay,
+    ReportData,
+    StageRecord,
+    network_cost,
+)
+from autocost_jax.store import list_stages, read_config, read_metrics
+
+
+def load_report(path: str | Path) -> ReportData:
+    """Everything the report of a run shows; works on unfinished runs, too.
+
+    Raises:
+      RunDirError: the directory is not a run, or one of its files is broken.
+    """
+    path = Path(path)
+    config, facts = read_config(path, SearchConfig)
+    rows = read_metrics(path)
+    stages = tuple(
+        _stage(config, load_arrays(file, None)) for file in list_stages(path).values()
+    )
+    card = _read_card(path)
+    return ReportData(
+        title=f"AutoCost on {config.train.env.name}",
+        config=_config_lines(config, facts, rows),
+        algorithms=config.algorithms,
+        deterministic=False,
+        hazard_radius=config.train.env.hazards_size,
+        stages=stages,
+        best=_best(stages, card),
+        curves=tuple(_curves(config, rows)),
+        replay=_replay(path, config),
+        evaluations=tuple(
+            Evaluation(
+                label=f"{name}, best cost, fresh layouts",
+                **{k: v for k, v in row.items() if k != "distance_travelled"},
+            )
+            for name, row in card.get("evaluation", {}).items()
+        ),
+    )
+
+
+def _read_card(path: Path) -> dict[str, Any]:
+    file = path / "cost.json"
+    if not file.exists():
+        return {}
+    try:
+        return json.loads(file.read_text())
+    except ValueError as error:
+        raise RunDirError(f"{file} is not readable: {error}") from None
+
+
+def _stage(config: SearchConfig, arrays: dict[str, np.ndarray]) -> StageRecord:
+    far, near = arrays["scores/intrinsic_far"], arrays["scores/intrinsic_near"]
+    return StageRecord(
+        theta=arrays["theta"],
+        cost=arrays["cost"],
+        ep_return=arrays["ep_return"],
+        algorithm_cost=arrays["scores/ep_cost"],
+        algorithm_return=arrays["scores/ep_return"],
+        zero_violation=arrays["cost"] <= config.zero_tolerance,
+        elites=arrays["order"][: config.num_elites],
+        far_cost=far.mean(0),
+        near_cost=near.mean(0),
+        distance_travelled=arrays["scores/distance_travelled"],
+    )
+
+
+def _best(
+    stages: tuple[StageRecord, ...], card: dict[str, Any]
+) -> BestCandidate | None:
+    """The card's pick; before there is one, the best of the finished stages."""
+    ranked = [
+        (max(cost, 0.0) if not zero else 0.0, -ep_return, number, index)
+        for number, stage in enumerate(stages)
+        for index, (cost, ep_return, zero) in enumerate(
+            zip(stage.cost, stage.ep_return, stage.zero_violation, strict=True)
+        )
+        if np.isfinite(cost) and np.isfinite(ep_return)
+    ]
+    if not ranked:
+        return None
+    number, index = min(ranked)[2:]
+    number, index = card.get("stage", number), card.get("index", index)
+    stage = stages[number]
+    is_zero = bool(stage.zero_violation[index])
+    shown = ("environment", "search_cost", "search_return", "env_steps", "seed")
+    return BestCandidate(
+        stage=number,
+        index=index,
+        theta=stage.theta[index],
+        label="zero violation, highest return" if is_zero else "lowest cost",
+        card=tuple(f"{key}: {card[key]}" for key in shown if key in card),
+    )
+
+
+def _curves(config: SearchConfig, rows: list[dict[str, Any]]) -> list[Curve]:
+    curves = []
+    for number in sorted({row["stage"] for row in rows}):
+        chosen = [row for row in rows if row["stage"] == number]
+        for name in config.algorithms:
+
+            def column(key: str, name=name, chosen=chosen) -> np.ndarray:
+                return np.asarray([row[f"{name}/{key}"] for row in chosen], float)
+
+            curves.append(
+                Curve(
+                    stage=number,
+                    algorithm=name,
+                    epoch=np.asarray([row["epoch"] for row in chosen]),
+                    ep_return=column("ep_return"),
+                    ep_cost=column("ep_cost"),
+                    ep_total_cost=column("ep_total_cost"),
+                )
+            )
+    return curves
+
+
+def _replay(path: Path, config: SearchConfig) -> Replay | None:
+    file, cost = path / "replay.npz", path / "cost.npz"
+    if not (file.exists() and cost.exists()):
+        return None
+    arrays = load_arrays(file, None)
+    env = make_env(config.train.env)
+    theta = load_arrays(cost, None)["theta"]
+    return Replay(
+        **arrays,
+        hazard_radius=config.train.env.hazards_size,
+        goal_radius=config.train.env.goal_size,
+        intrinsic=network_cost(theta, arrays["constraint_lidar"]),
+        dt=env.dt,
+        extents=config.train.env.placements_extents,
+        label=f"{config.algorithms[0]} trained with the best cost, sampled actions",
+    )
+
+
+def _config_lines(
+    config: SearchConfig, facts: dict[str, Any], rows: list[dict[str, Any]]
+) -> dict[str, str]:
+    train, agent = config.train, config.train.agent
+    versions = facts.get("versions", {})
+    lines = {
+        "environment": train.env.name,
+        "algorithms": ", ".join(config.algorithms),
+        "cost limit": f"{config.cost_limit:g}",
+        "population": f"{config.population_size} candidates, {config.num_elites} elites",
+        "stages": str(config.num_stages),
+        "selection": config.selection,
+        "initial std of theta": f"{config.init_std:g}",
+        "epochs a stage": f"{train.num_epochs}, the last {config.fitness_epochs} count",
+        "an epoch": f"{train.num_worlds} worlds x {train.env.num_steps} steps a slot",
+        "networks": "-".join(str(size) for size in agent.hidden_sizes),
+        "policy steps": f"{agent.policy_passes} passes x {agent.policy_minibatches}",
+        "critic steps": f"{agent.value_passes} passes x {agent.value_minibatches}",
+        "seed": str(config.seed),
+        "env steps": f"{config.env_steps:,}",
+        "device": f"{facts.get('num_devices', '?')} x {facts.get('device', '?')}",
+    }
+    rates = [row.get("time/env_steps_per_second") for row in rows]
+    if rates and rates[-1]:
+        lines["steps/s"] = f"{rates[-1]:,.0f}"
+    lines["versions"] = ", ".join(f"{name} {text}" for name, text in versions.items())
+    lines["commit"] = str(facts.get("commit"))
+    return lines
