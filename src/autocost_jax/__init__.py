@@ -1,1 +1,87 @@
-"""AutoCost in JAX."""
+"""AutoCost in JAX: evolve intrinsic costs until agents stop violating constraints.
+
+The public names; each is documented where it is defined. `python -m
+autocost_jax.evolve` is the main job, `autocost --help` lists the other commands.
+"""
+
+from autocost_jax.agents.base import Agent, AgentState
+from autocost_jax.agents.cpo import cpo
+from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
+from autocost_jax.config import (
+    PRESETS,
+    AgentConfig,
+    EnvConfig,
+    SearchConfig,
+    TrainConfig,
+    preset,
+)
+from autocost_jax.costs import (
+    BANK,
+    CostTerm,
+    intrinsic_cost,
+    load_cost,
+    save_cost,
+    total_cost,
+    training_cost,
+)
+from autocost_jax.envs.env import Env, list_envs, make_env
+from autocost_jax.es import ES, Fitness, best, mutate, select, truncation_es
+from autocost_jax.evaluate import evaluate
+from autocost_jax.evolution import evolve, search
+from autocost_jax.population import make_population, stack_slots
+from autocost_jax.records import (
+    CostInputs,
+    EnvState,
+    EvalResult,
+    Layout,
+    Slot,
+    TrainingCost,
+    Trajectory,
+)
+from autocost_jax.rollout import reset_worlds, unroll
+from autocost_jax.train import run_stage, train
+
+__all__ = [
+    "BANK",
+    "ES",
+    "PRESETS",
+    "Agent",
+    "AgentConfig",
+    "AgentState",
+    "CostInputs",
+    "CostTerm",
+    "Env",
+    "EnvConfig",
+    "EnvState",
+    "EvalResult",
+    "Fitness",
+    "Layout",
+    "SearchConfig",
+    "Slot",
+    "TrainConfig",
+    "TrainingCost",
+    "Trajectory",
+    "best",
+    "cpo",
+    "evaluate",
+    "evolve",
+    "intrinsic_cost",
+    "list_envs",
+    "load_cost",
+    "make_env",
+    "make_population",
+    "mutate",
+    "ppo_lagrangian",
+    "preset",
+    "reset_worlds",
+    "run_stage",
+    "save_cost",
+    "search",
+    "select",
+    "stack_slots",
+    "total_cost",
+    "train",
+    "training_cost",
+    "truncation_es",
+    "unroll",
+]

@@ -32,8 +32,9 @@ def _first_sentence(panel: str) -> str:
     """The message of tyro's error panel without its frame, on one line."""
     lines = [re.sub(r"[│╭╮╰╯─]+", " ", line).strip() for line in panel.splitlines()]
     text = " ".join(line for line in lines if line)
-    text = re.sub(r"^(Parsing error|Unrecognized options|Missing required)\s+", "", text)
-    return re.split(r"\s+(?:For full helptext|Arguments similar)", text)[0].strip()
+    text = re.sub(r"^(Parsing error|Value error|Error parsing \S+:)\s+", "", text)
+    text = re.sub(r"^Error parsing (search|train):\s+", "", text)
+    return re.split(r"\s+(?:Argument helptext|For full helptext|Arguments similar)", text)[0]
 
 
 def fail(message: str, status: int = BAD_INPUT) -> None:

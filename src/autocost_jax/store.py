@@ -304,8 +304,7 @@ class RunDir:
     def write_cost(self, arrays: Mapping[str, Any], card: Mapping[str, Any]) -> Path:
         """Write cost.npz and its card, cost.json."""
         save_arrays(self.path / "cost.npz", arrays)
-        text = json.dumps(to_json(card), indent=2, allow_nan=False)
-        write_atomic(self.path / "cost.json", text.encode() + b"\n")
+        self.write_json("cost", card)
         return self.path / "cost.npz"
 
     def write_policy(self, name: str, params: Any) -> Path:
@@ -318,6 +317,13 @@ class RunDir:
         """Write NAME.npz."""
         save_arrays(self.path / f"{name}.npz", arrays)
         return self.path / f"{name}.npz"
+
+    def write_json(self, name: str, value: Mapping[str, Any]) -> Path:
+        """Write NAME.json."""
+        file = self.path / f"{name}.json"
+        text = json.dumps(to_json(value), indent=2, allow_nan=False)
+        write_atomic(file, text.encode() + b"\n")
+        return file
 
     def _sync_metrics(self) -> int:
         file = self.path / METRICS
@@ -332,7 +338,8 @@ class RunDir:
 def _run_files(path: Path) -> list[Path]:
     """What a run owns in its directory, but for its config and its lock."""
     names = (METRICS, "tensorboard", "checkpoints", "policies", "report")
-    patterns = (*names, "stage_*.npz", "cost.npz", "cost.json", f"{TEMPORARY}*")
+    arrays = ("stage_*.npz", "cost.npz", "cost.json", "replay.npz")
+    patterns = (*names, *arrays, f"{TEMPORARY}*")
     return [file for pattern in patterns for file in path.glob(pattern)]
 
 

@@ -1,5 +1,8 @@
 """Safety Gym's worlds in MuJoCo MJX."""
 
-from autocost_jax.envs.env import Env, list_envs, make_env
+import contextlib
+import io
 
-__all__ = ["Env", "list_envs", "make_env"]
+# MJX prints a line for each optional backend that is not installed.
+with contextlib.redirect_stdout(io.StringIO()):
+    import mujoco.mjx  # noqa: F401

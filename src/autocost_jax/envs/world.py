@@ -24,6 +24,7 @@ class World(NamedTuple):
 
     Attributes:
       mj_model: the MuJoCo model; for rendering and for references in C.
+      rest: data at the origin, at rest; a template.
       place: layout -> data at rest there, sensors evaluated.
       control_step: (data, action [U]) -> data one control period later.
       robot_xy: data -> [2] robot origin, from `qpos` alone.
@@ -36,6 +37,7 @@ class World(NamedTuple):
     """
 
     mj_model: mujoco.MjModel
+    rest: mjx.Data
     place: Callable[[Layout], mjx.Data]
     control_step: Callable[[mjx.Data, jax.Array], mjx.Data]
     robot_xy: Callable[[mjx.Data], jax.Array]
@@ -106,6 +108,7 @@ def make_world(config: EnvConfig) -> World:
 
     return World(
         mj_model=mj_model,
+        rest=rest,
         place=place,
         control_step=control_step,
         robot_xy=robot_xy,

@@ -1,0 +1,279 @@
+"""Methods x seeds trained together: a table of slots for the population program.
+
+A method is an algorithm and a training cost; a figure of the paper is a table of them.
+The run directory holds the configuration, metrics, checkpoints, the policy of every
+slot and their scores over fresh episodes.
+"""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from autocost_jax.arrays import flatten
+from autocost_jax.config import TrainConfig
+from autocost_jax.costs import training_cost
+from autocost_jax.envs.env import make_env
+from autocost_jax.population import (
+    Population,
+    make_agents,
+    make_evaluator,
+    make_population,
+    stack_slots,
+)
+from autocost_jax.progress import Display, format_seconds
+from autocost_jax.records import Slot
+from autocost_jax.run import EVALUATION, eval_summary, load_policies
+from autocost_jax.store import RunDir, check_free_space, estimate_bytes
+from autocost_jax.train import Learner
+
+Learners = Literal["ppo", "ppo_lagrangian", "cpo"]
+GROUPS = ("ppo_lagrangian", "cpo")  # PPO is a PPO-Lagrangian slot that ignores cost
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the table.
+
+    Attributes:
+      label: its name in files and tables.
+      algorithm: ppo, ppo_lagrangian or cpo.
+      cost: the training cost, see `costs.training_cost`.
+      limit: allowed training cost of an episode.
+      theta: the intrinsic network's 41 parameters, if `cost` uses it.
+    """
+
+    label: str
+    algorithm: Learners = "ppo_lagrangian"
+    cost: str = "extrinsic"
+    limit: float = 0.0
+    theta: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.algorithm not in ("ppo", *GROUPS):
+            raise ValueError(
+                f"algorithm must be ppo, ppo_lagrangian or cpo, got {self.algorithm!r}"
+            )
+        theta = None if self.theta is None else np.asarray(self.theta)
+        training_cost(self.cost, theta, self.limit)
+
+
+@dataclass(frozen=True)
+class TableConfig:
+    """What is trained: every method with every seed, side by side.
+
+    Attributes:
+      train: worlds, epochs and the learners' settings.
+      methods: the rows; labels are distinct.
+      seeds: one slot a method and seed.
+    """
+
+    train: TrainConfig = field(default_factory=TrainConfig)
+    methods: tuple[Method, ...] = ()
+    seeds: tuple[int, ...] = (0,)
+
+    def __post_init__(self) -> None:
+        labels = [method.label for method in self.methods]
+        if not labels or len(set(labels)) < len(labels):
+            raise ValueError(f"methods must have distinct labels, got {labels}")
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds must be distinct numbers, got {self.seeds}")
+
+    def group(self, name: str) -> list[tuple[Method, int]]:
+        """The slots of one algorithm group, in order."""
+        return [
+            (method, seed)
+            for method in self.methods
+            for seed in self.seeds
+            if (method.algorithm == "cpo") == (name == "cpo")
+        ]
+
+    @property
+    def algorithms(self) -> tuple[str, ...]:
+        """The groups that have slots."""
+        return tuple(name for name in GROUPS if self.group(name))
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps of the whole table."""
+        epoch = self.train.num_worlds * self.train.env.num_steps
+        slots = len(self.methods) * len(self.seeds)
+        return slots * self.train.num_epochs * epoch
+
+
+class TableState(struct.PyTreeNode):
+    """What a checkpoint holds.
+
+    Attributes:
+      learners: for each group, stacked [P, ...].
+      epoch: [] int32 epochs done.
+    """
+
+    learners: tuple[Learner, ...]
+    epoch: jax.Array
+
+
+def table_slots(config: TableConfig) -> tuple[Slot, ...]:
+    """The stacked slots of each group; the key of a slot is that of its seed."""
+
+    def slot(method: Method, seed: int) -> Slot:
+        theta = None if method.theta is None else np.asarray(method.theta)
+        return Slot(
+            cost=training_cost(method.cost, theta, method.limit),
+            key=jax.random.key(seed),
+            constrained=jnp.asarray(method.algorithm != "ppo", jnp.float32),
+        )
+
+    return tuple(
+        stack_slots([slot(method, seed) for method, seed in config.group(name)])
+        for name in config.algorithms
+    )
+
+
+def run_table(
+    config: TableConfig,
+    path: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    devices: Sequence[jax.Device] | None = None,
+    num_episodes: int = 100,
+) -> list[dict[str, Any]]:
+    """Train and evaluate a table in a run directory, or resume it.
+
+    Args:
+      config: the table; on resume it must be the run's own.
+      path: the run directory.
+      resume: continue from the newest whole checkpoint.
+      overwrite: start over in a directory that already holds a run.
+      devices: default: the first one.
+      num_episodes: fresh episodes a slot in the final evaluation.
+
+    Returns:
+      For each slot its method, seed and scores, as in evaluation.json.
+
+    Raises:
+      RunDirError: the directory is not usable for this run.
+      DiskFullError: the disk is full; the directory is intact.
+    """
+    devices = list(devices or jax.devices()[:1])
+    env = make_env(config.train.env)
+    agents = make_agents(config.algorithms, config.train, env)
+    population = make_population(env, agents, config.train, devices=devices)
+    slots = table_slots(config)
+    if resume:
+        run = RunDir.open(path, config)
+    else:
+        run = RunDir.create(path, config, overwrite=overwrite)
+    with run, Display(config.env_steps, 0, sys.stdout) as display:
+        for line in run.warnings:
+            display.say(line)
+        display.say(
+            f"{env.config.name}: {len(config.methods)} methods x {len(config.seeds)} "
+            f"seeds, {config.env_steps:,} env steps on {len(devices)} device(s)"
+        )
+        learners = population.init(slots)
+        state = TableState(learners=learners, epoch=jnp.zeros((), jnp.int32))
+        check_free_space(run.path, 4 * estimate_bytes(state))
+        checkpoint = run.resume(state) if resume else None
+        if checkpoint is not None:
+            state = checkpoint.tree
+            display.say(f"resuming {path} after {int(state.epoch)} epochs")
+        run.start_tensorboard(purge_step=int(state.epoch) or None)
+        state = _train(run, config, population, slots, state, display)
+        return _finish(run, config, state, display, num_episodes)
+
+
+def _train(
+    run: RunDir,
+    config: TableConfig,
+    population: Population,
+    slots: tuple[Slot, ...],
+    state: TableState,
+    display: Display,
+) -> TableState:
+    chunk, total = config.train.chunk_epochs, config.train.num_epochs
+    start, first = time.monotonic(), int(state.epoch)
+    for epoch in range(first, total, chunk):
+        learners, metrics = population.chunk(state.learners, slots, epoch)
+        state = TableState(learners=learners, epoch=jnp.asarray(epoch + chunk))
+        state = state.replace(epoch=state.epoch.astype(jnp.int32))
+        metrics = jax.tree.map(np.asarray, metrics)
+        for k in range(chunk):
+            row: dict[str, Any] = {"epoch": epoch + k}
+            for name, group in zip(config.algorithms, metrics, strict=True):
+                row |= {f"{name}/{key}": value[k] for key, value in group.items()}
+            run.log_metrics(row, epoch + k)
+        run.save_checkpoint(state, epoch + chunk)
+        left = (time.monotonic() - start) / (epoch + chunk - first)
+        display.say(
+            f"epoch {epoch + chunk}/{total}  "
+            + "  ".join(_line(config, name, metrics[i]) for i, name in _groups(config))
+            + f"  time left {format_seconds(left * (total - epoch - chunk))}"
+        )
+    return state
+
+
+def _groups(config: TableConfig) -> list[tuple[int, str]]:
+    return list(enumerate(config.algorithms))
+
+
+def _line(config: TableConfig, name: str, metrics: dict[str, np.ndarray]) -> str:
+    """Return / cost of each method, means over its seeds."""
+    cells: dict[str, list[int]] = {}
+    for index, (method, _) in enumerate(config.group(name)):
+        cells.setdefault(method.label, []).append(index)
+    return "  ".join(
+        f"{label} {metrics['ep_return'][-1, index].mean():.1f}/"
+        f"{metrics['ep_cost'][-1, index].mean():.2f}"
+        for label, index in cells.items()
+    )
+
+
+def _finish(
+    run: RunDir,
+    config: TableConfig,
+    state: TableState,
+    display: Display,
+    num_episodes: int,
+) -> list[dict[str, Any]]:
+    """Save every policy, score it over fresh episodes, write evaluation.json."""
+    files, table = [], []
+    for i, name in _groups(config):
+        for index, (method, seed) in enumerate(config.group(name)):
+            params = jax.tree.map(
+                lambda leaf, i=i, index=index: leaf[index],
+                state.learners[i].agent.policy,
+            )
+            stem = f"{method.label}_seed{seed}"
+            files.append(run.write_policy(stem, flatten(params)))
+            table.append({"method": method.label, "seed": seed})
+    display.say(f"evaluating {len(files)} policies over {num_episodes} episodes ...")
+    agent, states = load_policies(config, files)
+    env = make_env(config.train.env)
+    key = jax.random.key(EVALUATION)
+    results, _ = make_evaluator(env, agent, num_episodes)(states, key)
+    for i, row in enumerate(table):
+        row |= eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
+    run.write_json("evaluation", {"episodes": num_episodes, "rows": table})
+    for row in table:
+        display.say(table_line(row))
+    display.say(f"done in {format_seconds(display.elapsed)}; see {run.path}")
+    return table
+
+
+def table_line(row: dict[str, Any]) -> str:
+    """One evaluated slot for people."""
+    return (
+        f"  {row['method']} seed {row['seed']}: return {row['return_mean']:.2f} +- "
+        f"{row['return_ci']:.2f}, extrinsic cost {row['cost_mean']:.3f} +- "
+        f"{row['cost_ci']:.3f}, violating episodes {row['violation_rate']:.1%} of "
+        f"{row['episodes']}"
+    )

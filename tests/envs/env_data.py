@@ -1,0 +1,46 @@
+"""Recorded data and compiled environments for the tests of this folder."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from autocost_jax.config import EnvConfig
+from autocost_jax.envs.env import Env, make_env
+from autocost_jax.records import EnvState, Layout
+
+DATA = Path(__file__).parents[1] / "data"
+NUM_WORLDS = 200  # one batch size for all tests, so that each function compiles once
+
+# Safety Gym's own PointGoal1, less its vase.
+POINT_GOAL_1 = EnvConfig(
+    placements_extents=(-1.5, -1.5, 1.5, 1.5),
+    goal_keepout=0.305,
+    hazards_size=0.2,
+    hazards_keepout=0.18,
+    constrain_indicator=True,
+    lidar_num_bins=16,
+    lidar_max_dist=3.0,
+)
+
+
+class Compiled(NamedTuple):
+    """An environment with its functions jitted over `NUM_WORLDS` worlds."""
+
+    env: Env
+    reset: Callable[[jax.Array], EnvState]
+    reset_to: Callable[[Layout, jax.Array], EnvState]
+    step: Callable[[EnvState, jax.Array], EnvState]
+
+
+def load(name: str) -> dict[str, np.ndarray]:
+    with np.load(DATA / f"{name}.npz", allow_pickle=False) as file:
+        return dict(file)
+
+
+def compile_env(config: EnvConfig) -> Compiled:
+    env = make_env(config)
+    functions = (env.reset, env.reset_to, env.step)
+    return Compiled(env, *(jax.jit(jax.vmap(function)) for function in functions))

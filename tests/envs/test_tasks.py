@@ -1,0 +1,95 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from env_data import load
+
+from autocost_jax.config import EnvConfig
+from autocost_jax.envs.constraints import distances_to, hazard_constraint
+from autocost_jax.envs.sensors import lidar
+from autocost_jax.envs.tasks import goal_task
+from autocost_jax.records import Layout
+
+FLOAT32 = 1e-5  # float32 against the engine's float64
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return load("reward_cost_goal")
+
+
+@pytest.fixture(scope="module")
+def layouts(recorded):
+    """The 400 scripted poses as layouts, fields [400, ...]."""
+    num = len(recorded["xy"])
+
+    def repeat(value):
+        value = jnp.asarray(value, jnp.float32)
+        return jnp.broadcast_to(value, (num, *value.shape))
+
+    return Layout(
+        robot_xy=jnp.asarray(recorded["xy"], jnp.float32),
+        robot_yaw=jnp.asarray(recorded["yaw"], jnp.float32),
+        goal_xy=repeat(recorded["goal"]),
+        hazards=repeat(recorded["hazards"]),
+        pillars=repeat(np.zeros((0, 2))),
+        box_xy=repeat(np.zeros(2)),
+        box_yaw=repeat(0.0),
+    )
+
+
+def test_reward_matches_safety_gym(recorded, layouts):
+    task = goal_task(EnvConfig(goal_size=float(recorded["goal_size"])))
+    distances = jax.vmap(task.distances)(layouts)
+    np.testing.assert_allclose(distances[:, 0], recorded["dist_goal"], atol=FLOAT32)
+    start = jnp.full((1, 1), recorded["dist_goal0"], jnp.float32)
+    previous = jnp.concatenate([start, distances[:-1]])
+    reward = jax.vmap(task.reward)(previous, distances)
+    np.testing.assert_allclose(reward, recorded["reward"], atol=FLOAT32)
+    is_met = jax.vmap(task.is_met)(distances)
+    np.testing.assert_array_equal(is_met, recorded["goal_met"])
+    total = reward + recorded["reward_goal"] * is_met
+    np.testing.assert_allclose(total, recorded["reward_total"], atol=FLOAT32)
+
+
+def test_dense_reward_is_clipped():
+    task = goal_task(EnvConfig(reward_distance=100.0))
+    assert float(task.reward(jnp.array([1.0]), jnp.array([0.5]))) == 10.0
+    assert float(task.reward(jnp.array([0.5]), jnp.array([1.0]))) == -10.0
+
+
+@pytest.mark.parametrize(
+    ("indicator", "expected"),
+    [(False, "cost_hazards_dense"), (True, "cost_hazards_indicator")],
+)
+def test_hazard_cost_matches_safety_gym(recorded, layouts, indicator, expected):
+    size = float(recorded["hazards_size"])
+    config = EnvConfig(hazards_size=size, constrain_indicator=indicator)
+    constraint = hazard_constraint(config)
+    distances = jax.vmap(lambda layout: distances_to(constraint, layout))(layouts)
+    np.testing.assert_allclose(distances, recorded["hazard_dist"], atol=FLOAT32)
+    cost = jax.vmap(constraint.cost)(distances)
+    assert recorded[expected].max() > 0
+    np.testing.assert_allclose(cost, recorded[expected], atol=FLOAT32)
+
+
+def test_dense_cost_is_the_papers_while_hazards_do_not_overlap(recorded, layouts):
+    closest = np.maximum(0, 0.2 - recorded["hazard_dist"].min(-1))
+    np.testing.assert_allclose(
+        recorded["paper_dense_hazard_cost"], closest, atol=FLOAT32
+    )
+
+
+@pytest.mark.parametrize("name", ["goal_lidar", "hazards_lidar"])
+def test_lidars_match_safety_gym(recorded, layouts, name):
+    task, constraint = goal_task(EnvConfig()), hazard_constraint(EnvConfig())
+
+    def read(layout):
+        cos, sin, zero = jnp.cos(layout.robot_yaw), jnp.sin(layout.robot_yaw), 0.0
+        rotation = jnp.array([[cos, -sin, zero], [sin, cos, zero], [zero, zero, 1.0]])
+        sees = {**task.lidars, constraint.lidar_name: constraint.objects}[name]
+        position = jnp.append(layout.robot_xy, 0.1)
+        return lidar(sees(layout), position, rotation, num_bins=16, max_dist=3.0)
+
+    got = jax.jit(jax.vmap(read))(layouts)
+    np.testing.assert_allclose(got, recorded[name], atol=FLOAT32)
