@@ -243,3 +243,7 @@ def _info(argv: list[str]) -> None:
         "cost terms": [term.name for term in BANK],
     }
     print(yaml.safe_dump(facts, sort_keys=False), end="")
+
+
+if __name__ == "__main__":
+    main()

@@ -17,7 +17,7 @@ from autocost_jax import es as es_lib
 from autocost_jax.config import SearchConfig
 from autocost_jax.costs import BANK, CostTerm, training_cost
 from autocost_jax.envs.env import make_env
-from autocost_jax.es import ES, ESState, Fitness, truncation_es
+from autocost_jax.es import ESState, Fitness, truncation_es
 from autocost_jax.population import (
     Population,
     candidate_slots,
@@ -69,7 +69,6 @@ class StageResult(struct.PyTreeNode):
       scores: `TRACKED` metrics averaged over the fitness epochs, each [A, P].
       order: [P] candidate indices, best first, by the paper's rule.
       frozen: [A, P] bool, agents that met a non-finite number.
-      learners: the trained agents, for each algorithm stacked [P, ...].
     """
 
     candidates: jax.Array
@@ -77,7 +76,6 @@ class StageResult(struct.PyTreeNode):
     scores: Metrics
     order: jax.Array
     frozen: jax.Array
-    learners: tuple[Learner, ...]
 
 
 class Progress(NamedTuple):
@@ -88,12 +86,14 @@ class Progress(NamedTuple):
       epoch: first epoch of the chunk.
       metrics: for each algorithm, NumPy arrays [K, P].
       result: the stage's result if this chunk ended it, else None.
+      learners: with a result the trained agents, for each algorithm stacked [P, ...].
     """
 
     stage: int
     epoch: int
     metrics: tuple[dict[str, np.ndarray], ...]
-    result: StageResult | None
+    result: StageResult | None = None
+    learners: tuple[Learner, ...] = ()
 
 
 class SearchResult(struct.PyTreeNode):
@@ -110,20 +110,38 @@ class SearchResult(struct.PyTreeNode):
     scores: Metrics
 
 
+class StageFunctions(NamedTuple):
+    """What happens around the chunks of a stage, as pure functions.
+
+    Attributes:
+      init: () -> the state of the evolutionary strategy before the first stage.
+      begin: (es state, stage) -> candidates and, for each algorithm, slots.
+      slots: (stage, candidates) -> slots.
+      record: (history, metrics, epoch) -> history with the chunk's metrics.
+      end: (es state, stage, candidates, history, frozen) -> es state and result.
+    """
+
+    init: Callable[[], ESState]
+    begin: Callable[..., tuple[jax.Array, tuple[Slot, ...]]]
+    slots: Callable[..., tuple[Slot, ...]]
+    record: Callable[..., Metrics]
+    end: Callable[..., tuple[ESState, StageResult]]
+
+
 class Searcher(NamedTuple):
-    """The jitted pieces of a search on given devices.
+    """The compiled pieces of a search on given devices.
 
     Attributes:
       config: the search.
       root: its root key.
       population: the population program.
-      es: the evolutionary strategy, jitted.
+      stage: the functions around it, jitted.
     """
 
     config: SearchConfig
     root: Key
     population: Population
-    es: ES
+    stage: StageFunctions
 
 
 def stage_key(root: Key, stage: jax.Array | int, purpose: int) -> Key:
@@ -154,7 +172,7 @@ def stage_result(
     config: SearchConfig,
     candidates: jax.Array,
     history: Metrics,
-    learners: tuple[Learner, ...],
+    frozen: jax.Array,
 ) -> StageResult:
     """Fitness and scores of a finished stage; a frozen agent costs +inf.
 
@@ -162,13 +180,12 @@ def stage_result(
       config: the search.
       candidates: [P, D].
       history: `TRACKED` metrics [num_epochs, A, P].
-      learners: trained, for each algorithm [P, ...].
+      frozen: [A, P] bool.
     """
     last = {
         name: jnp.mean(value[-config.fitness_epochs :], axis=0)
         for name, value in history.items()
     }
-    frozen = jnp.stack([group.frozen for group in learners])
     broken = jnp.any(frozen, axis=0)
     fitness = Fitness(
         cost=jnp.where(broken, jnp.inf, jnp.mean(last["ep_cost"], axis=0)),
@@ -180,8 +197,42 @@ def stage_result(
         scores=last,
         order=es_lib.rank(fitness, config.zero_tolerance),
         frozen=frozen,
-        learners=learners,
     )
+
+
+def stage_functions(
+    config: SearchConfig, root: Key, bank: Sequence[CostTerm] = BANK
+) -> StageFunctions:
+    """The functions around the chunks of a search."""
+    strategy = truncation_es(config)
+
+    def begin(state: ESState, stage: jax.Array | int):
+        candidates = strategy.ask(stage_key(root, stage, ASK), state)
+        return candidates, slots(stage, candidates)
+
+    def slots(stage: jax.Array | int, candidates: jax.Array) -> tuple[Slot, ...]:
+        return stage_slots(config, root, stage, candidates, bank)
+
+    def record(history: Metrics, metrics: tuple[Metrics, ...], epoch: jax.Array | int):
+        return {
+            name: jax.lax.dynamic_update_slice_in_dim(
+                value, jnp.stack([group[name] for group in metrics], 1), epoch, 0
+            )
+            for name, value in history.items()
+        }
+
+    def end(
+        state: ESState,
+        stage: jax.Array | int,
+        candidates: jax.Array,
+        history: Metrics,
+        frozen: jax.Array,
+    ):
+        result = stage_result(config, candidates, history, frozen)
+        key = stage_key(root, stage, TELL)
+        return strategy.tell(key, state, candidates, result.fitness), result
+
+    return StageFunctions(strategy.init, begin, slots, record, end)
 
 
 def search(
@@ -190,12 +241,12 @@ def search(
     """The whole search as one pure function of its root key; jit or vmap it."""
     env = make_env(config.train.env)
     agents = make_agents(config.algorithms, config.train, env)
-    strategy = truncation_es(config)
 
     def run(root: Key) -> SearchResult:
+        functions = stage_functions(config, root, bank)
+
         def body(state: ESState, stage: jax.Array):
-            candidates = strategy.ask(stage_key(root, stage, ASK), state)
-            slots = stage_slots(config, root, stage, candidates, bank)
+            candidates, slots = functions.begin(state, stage)
             learners = tuple(
                 jax.vmap(lambda slot, agent=agent: init_learner(agent, slot))(group)
                 for agent, group in zip(agents, slots, strict=True)
@@ -207,13 +258,12 @@ def search(
                 name: jnp.stack([group[name] for group in metrics], 1)
                 for name in TRACKED
             }
-            result = stage_result(config, candidates, history, learners)
-            key = stage_key(root, stage, TELL)
-            state = strategy.tell(key, state, candidates, result.fitness)
+            frozen = jnp.stack([group.frozen for group in learners])
+            state, result = functions.end(state, stage, candidates, history, frozen)
             return state, (result.fitness, result.scores)
 
         stages = jnp.arange(config.num_stages)
-        state, (fitness, scores) = jax.lax.scan(body, strategy.init(), stages)
+        state, (fitness, scores) = jax.lax.scan(body, functions.init(), stages)
         return SearchResult(es=state, fitness=fitness, scores=scores)
 
     return run
@@ -227,17 +277,18 @@ def make_searcher(
     """Build the program of a search; nothing is compiled yet."""
     env = make_env(config.train.env)
     agents = make_agents(config.algorithms, config.train, env)
+    root = jax.random.key(config.seed)
     return Searcher(
         config=config,
-        root=jax.random.key(config.seed),
+        root=root,
         population=make_population(env, agents, config.train, bank, devices),
-        es=jit_bundle(truncation_es(config)),
+        stage=jit_bundle(stage_functions(config, root, bank)),
     )
 
 
 def init_search(searcher: Searcher) -> SearchState:
     """The state before the first epoch of the first stage."""
-    return _begin_stage(searcher, searcher.es.init(), 0)
+    return _begin_stage(searcher, searcher.stage.init(), 0)
 
 
 def evolve(
@@ -275,9 +326,8 @@ def evolve(
 
 
 def _begin_stage(searcher: Searcher, es_state: ESState, stage: int) -> SearchState:
-    config, root = searcher.config, searcher.root
-    candidates = searcher.es.ask(stage_key(root, stage, ASK), es_state)
-    slots = stage_slots(config, root, stage, candidates)
+    config = searcher.config
+    candidates, slots = searcher.stage.begin(es_state, stage)
     shape = (config.train.num_epochs, len(config.algorithms), config.population_size)
     return SearchState(
         es=es_state,
@@ -293,32 +343,27 @@ def _run_chunk(
     searcher: Searcher, state: SearchState
 ) -> tuple[SearchState, Progress]:
     """One chunk; at a stage's end also `tell` and the beginning of the next stage."""
-    config, root = searcher.config, searcher.root
+    config, functions = searcher.config, searcher.stage
     stage, epoch = int(state.stage), int(state.epoch)
-    slots = stage_slots(config, root, stage, state.candidates)
+    slots = functions.slots(stage, state.candidates)
     learners, metrics = searcher.population.chunk(state.learners, slots, epoch)
+    history = functions.record(state.history, metrics, epoch)
     after = epoch + config.train.chunk_epochs
-    history = {
-        name: value.at[epoch:after].set(jnp.stack([m[name] for m in metrics], axis=1))
-        for name, value in state.history.items()
-    }
-    host_metrics = tuple(
-        {name: np.asarray(value) for name, value in group.items()} for group in metrics
-    )
+    progress = Progress(stage, epoch, jax.tree.map(np.asarray, metrics))
     state = state.replace(
         learners=learners, history=history, epoch=jnp.asarray(after, jnp.int32)
     )
     if after < config.train.num_epochs:
-        return state, Progress(stage, epoch, host_metrics, None)
-    result = stage_result(config, state.candidates, history, learners)
-    key = stage_key(root, stage, TELL)
-    es_state = searcher.es.tell(key, state.es, state.candidates, result.fitness)
+        return state, progress
+    frozen = jnp.stack([group.frozen for group in learners])
+    es_state, result = functions.end(
+        state.es, stage, state.candidates, history, frozen
+    )
+    progress = progress._replace(result=result, learners=learners)
     if stage + 1 < config.num_stages:
-        state = _begin_stage(searcher, es_state, stage + 1)
-    else:
-        over = jnp.asarray(config.num_stages, jnp.int32)
-        state = state.replace(es=es_state, stage=over)
-    return state, Progress(stage, epoch, host_metrics, result)
+        return _begin_stage(searcher, es_state, stage + 1), progress
+    over = jnp.asarray(config.num_stages, jnp.int32)
+    return state.replace(es=es_state, stage=over), progress
 
 
 def best_of(config: SearchConfig, state: ESState) -> Any:

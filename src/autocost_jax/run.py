@@ -22,7 +22,6 @@ from autocost_jax.evolution import (
     evolve,
     init_search,
     make_searcher,
-    stage_slots,
 )
 from autocost_jax.population import make_agents, make_evaluator
 from autocost_jax.progress import Display, format_seconds, summarise
@@ -158,9 +157,7 @@ def _start(
 def _compile(searcher: Searcher, state: SearchState, display: Display) -> None:
     display.say("compiling the population program ...")
     start = time.monotonic()
-    slots = stage_slots(
-        searcher.config, searcher.root, int(state.stage), state.candidates
-    )
+    slots = searcher.stage.slots(int(state.stage), state.candidates)
     searcher.population.compile(state.learners, slots)
     display.say(f"compiled in {time.monotonic() - start:.1f} s")
 
@@ -227,7 +224,7 @@ def _write_stage(
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     run.write_stage(progress.stage, arrays)
     top = int(result.order[0])
-    for name, learner in zip(config.algorithms, result.learners, strict=True):
+    for name, learner in zip(config.algorithms, progress.learners, strict=True):
         params = jax.tree.map(lambda leaf: leaf[top], learner.agent.policy)
         run.write_policy(policy_name(progress.stage, name), flatten(params))
 

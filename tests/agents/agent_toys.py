@@ -24,6 +24,9 @@ class Sizes(NamedTuple):
     episode_length: int = 20
 
 
+SIZES = Sizes()
+
+
 def make_slot(limit=0.0, constrained=1.0):
     cost = TrainingCost(
         weights=jnp.zeros(6), theta=jnp.zeros(41), limit=jnp.asarray(limit)
@@ -46,7 +49,7 @@ def make_trajectory(obs, action, reward, valid=None):
     )
 
 
-def act(agent, state, key, sizes=Sizes(), num_worlds=8):
+def act(agent, state, key, sizes=SIZES, num_worlds=8):
     """Random observations [T + 1, N, O] and sampled actions [T, N, U]."""
     key_obs, key_act = jax.random.split(key)
     shape = (sizes.episode_length + 1, num_worlds, sizes.observation_size)

@@ -95,7 +95,7 @@ def test_failed_world_is_cut_and_bootstrapped():
     valid = np.ones((9, 2))
     valid[5:, 1] = 0
     reward[5:, 1] = 0
-    got = gae(*map(jnp.array, (reward, value)), 0.99, 0.97, jnp.array(valid))
+    got = gae(jnp.array(reward), jnp.array(value), 0.99, 0.97, jnp.array(valid))
     whole = slow_gae(reward[:, 0], value[:, 0], 0.99, 0.97)
     cut = slow_gae(reward[:5, 1], value[:6, 1], 0.99, 0.97)
     for i in range(2):

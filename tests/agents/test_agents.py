@@ -1,20 +1,22 @@
 """One contract for every algorithm, and probes whose answers are known."""
 
 import dataclasses
+from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from agent_toys import FULL_BATCH, SMALL, Sizes, act, make_slot, make_trajectory
+from agent_toys import FULL_BATCH, SIZES, SMALL, Sizes, act, make_slot, make_trajectory
 
-from autocost_jax.agents import cpo, ppo_lagrangian
+from autocost_jax.agents import Agent, cpo, ppo_lagrangian
+from autocost_jax.agents.networks import make_networks
 
 AGENTS = {"ppo_lagrangian": ppo_lagrangian, "cpo": cpo}
 MODES = {"minibatch": SMALL, "full": FULL_BATCH}
 ACROSS_PROGRAMS = 1e-5  # one update, other batch shapes: rounding of float32 sums
-LONG_CRITICS = dataclasses.replace(FULL_BATCH, value_passes=600, value_lr=3e-3)
+LONG_CRITICS = dataclasses.replace(FULL_BATCH, value_passes=400, value_lr=3e-3)
 
 
 @pytest.fixture(params=AGENTS)
@@ -22,9 +24,25 @@ def make_agent(request):
     return AGENTS[request.param]
 
 
-@pytest.fixture(params=MODES)
-def config(request):
-    return MODES[request.param]
+class Problem(NamedTuple):
+    agent: Agent
+    update: Any  # compiled once for all tests, [4, ...] in and out
+    args: tuple[Any, ...]  # state, trajectory, cost, slot, key
+    clean: Any  # what update gives for args
+
+
+@pytest.fixture(scope="module", params=[(a, m) for a in AGENTS for m in MODES])
+def problem(request):
+    name, mode = request.param
+    agent = AGENTS[name](MODES[mode], SIZES)
+    chex.clear_trace_counter()
+    update = jax.jit(jax.vmap(chex.assert_max_traces(agent.update, n=1)))
+    args = stack_problem(agent)
+    return Problem(agent, update, args, update(*args))
+
+
+def pick(tree, lane):
+    return jax.tree.map(lambda leaf: leaf[lane], tree)
 
 
 def types(tree):
@@ -46,96 +64,86 @@ def stack_problem(agent, num_slots=4):
     return jax.vmap(one)(keys, jnp.arange(num_slots, dtype=jnp.float32))
 
 
-def test_update_keeps_types_and_is_finite_with_one_trace(make_agent, config):
-    agent = make_agent(config, Sizes())
-    state, trajectory, cost, slot, key = stack_problem(agent)
-    chex.clear_trace_counter()
-    update = jax.jit(chex.assert_max_traces(jax.vmap(agent.update), n=1))
-    new, metrics = update(state, trajectory, cost, slot, key)
-    newer, _ = update(new, trajectory, cost, slot, key)
+def test_update_keeps_types_and_is_finite_with_one_trace(problem):
+    state, trajectory, cost, slot, key = problem.args
+    new, metrics = problem.clean
+    newer, _ = problem.update(new, trajectory, cost, slot, key)
     assert types(new) == types(state) == types(newer)
     for leaf in jax.tree.leaves((newer, metrics)):
         assert np.all(np.isfinite(leaf))
     for name, value in metrics.items():
         assert value.shape == (4,), name
         assert value.dtype == jnp.float32, name
-    np.testing.assert_allclose(
-        metrics["j_c"], cost.sum(1).mean(-1), rtol=1e-5
-    )  # whole episodes: the mean episode sum
+    # whole episodes: the mean episode sum
+    np.testing.assert_allclose(metrics["j_c"], cost.sum(1).mean(-1), rtol=1e-5)
     changed = jax.tree.map(lambda a, b: np.any(a != b), state.critic, new.critic)
     assert all(jax.tree.leaves(changed))
 
 
-def test_a_nan_slot_harms_nobody(make_agent, config):
-    agent = make_agent(config, Sizes())
-    state, trajectory, cost, slot, key = stack_problem(agent)
-    update = jax.jit(jax.vmap(agent.update))
-    clean = update(state, trajectory, cost, slot, key)
+def test_a_nan_slot_harms_nobody(problem):
+    state, trajectory, cost, slot, key = problem.args
     poisoned = trajectory.replace(
         obs=trajectory.obs.at[1].set(jnp.nan),
         reward=trajectory.reward.at[2].set(jnp.inf),
     )
-    dirty = update(state, poisoned, cost.at[1].set(jnp.nan), slot, key)
+    dirty = problem.update(state, poisoned, cost.at[1].set(jnp.nan), slot, key)
     for lane in (0, 3):
-        chex.assert_trees_all_equal(
-            *(jax.tree.map(lambda leaf: leaf[lane], out) for out in (clean, dirty))
-        )
+        chex.assert_trees_all_equal(pick(problem.clean, lane), pick(dirty, lane))
 
 
-def test_what_an_invalid_world_holds_changes_nothing(make_agent, config):
-    agent = make_agent(config, Sizes())
-    args = jax.tree.map(lambda leaf: leaf[0], stack_problem(agent))
-    state, trajectory, cost, slot, key = args
-    valid = trajectory.valid.at[7:, 2].set(0.0).at[:, 5].set(0.0)
-    update = jax.jit(agent.update)
-    clean = update(state, trajectory.replace(valid=valid), cost, slot, key)
+def test_order_of_slots_changes_nothing(problem):
+    order = jnp.array([2, 0, 3, 1])
+    shuffled = problem.update(*pick(problem.args, order))
+    chex.assert_trees_all_equal(pick(problem.clean, order), shuffled)
+
+
+def test_what_an_invalid_world_holds_changes_nothing(problem):
+    state, trajectory, cost, slot, key = problem.args
+    valid = trajectory.valid.at[:, 7:, 2].set(0.0).at[:, :, 5].set(0.0)
+    weighted = trajectory.replace(valid=valid)
+    clean = problem.update(state, weighted, cost, slot, key)
     dead = valid == 0
-    broken = make_trajectory(
+    broken = weighted.replace(
         # s_7 of world 2 was reached by a valid step; what follows is garbage
-        trajectory.obs.at[8:, 2].set(jnp.nan).at[1:, 5].set(jnp.inf),
-        jnp.where(dead[..., None], jnp.nan, trajectory.action),
-        jnp.where(dead, jnp.nan, trajectory.reward),
-        valid,
+        obs=trajectory.obs.at[:, 8:, 2].set(jnp.nan).at[:, 1:, 5].set(jnp.inf),
+        action=jnp.where(dead[..., None], jnp.nan, trajectory.action),
+        reward=jnp.where(dead, jnp.nan, trajectory.reward),
     )
-    dirty = update(state, broken, jnp.where(dead, jnp.inf, cost), slot, key)
+    dirty = problem.update(state, broken, jnp.where(dead, jnp.inf, cost), slot, key)
     chex.assert_trees_all_equal(clean, dirty)
-    assert dirty[1]["valid_fraction"] == pytest.approx((160 - 13 - 20) / 160)
+    np.testing.assert_allclose(dirty[1]["valid_fraction"], (160 - 13 - 20) / 160)
 
 
-def test_an_invalid_world_is_as_good_as_none(make_agent):
-    agent = make_agent(FULL_BATCH, Sizes())
-    args = jax.tree.map(lambda leaf: leaf[0], stack_problem(agent))
-    state, trajectory, cost, slot, key = args
-    valid = trajectory.valid.at[:, 6:].set(0.0)
-    with_dead = agent.update(state, trajectory.replace(valid=valid), cost, slot, key)
-    fewer = make_trajectory(
-        trajectory.obs[:, :6], trajectory.action[:, :6], trajectory.reward[:, :6]
-    )
-    without = agent.update(state, fewer, cost[:, :6], slot, key)
-    for a, b in zip(*map(jax.tree.leaves, (with_dead[0], without[0])), strict=True):
-        np.testing.assert_allclose(a, b, atol=ACROSS_PROGRAMS)
-    assert with_dead[1]["j_c"] == pytest.approx(float(without[1]["j_c"]), rel=1e-5)
-
-
-def test_no_valid_world_stays_finite(make_agent, config):
-    agent = make_agent(config, Sizes())
-    args = jax.tree.map(lambda leaf: leaf[0], stack_problem(agent))
-    state, trajectory, cost, slot, key = args
+def test_no_valid_world_stays_finite(problem):
+    state, trajectory, cost, slot, key = problem.args
     dead = trajectory.replace(valid=jnp.zeros_like(trajectory.valid))
-    new, metrics = jax.jit(agent.update)(state, dead, cost, slot, key)
+    new, metrics = problem.update(state, dead, cost, slot, key)
     for leaf in jax.tree.leaves((new, metrics)):
         assert np.all(np.isfinite(leaf))
-    assert metrics["valid_fraction"] == 0
+    assert np.all(metrics["valid_fraction"] == 0)
 
 
-def test_vmap_agrees_with_one_slot_at_a_time(make_agent):
-    agent = make_agent(FULL_BATCH, Sizes())
+def test_one_slot_alone_and_an_invalid_world_is_as_good_as_none(make_agent):
+    """The same slot: vmapped, alone, with two dead worlds, without them."""
+    agent = make_agent(FULL_BATCH, SIZES)
     args = stack_problem(agent, 2)
-    together = jax.jit(jax.vmap(agent.update))(*args)[0]
+    state, trajectory, cost, slot, key = args
+    valid = trajectory.valid.at[:, :, 6:].set(0.0)
+    dead = jax.jit(jax.vmap(agent.update))(
+        state, trajectory.replace(valid=valid), cost, slot, key
+    )
+    fewer = make_trajectory(
+        trajectory.obs[:, :, :6],
+        trajectory.action[:, :, :6],
+        trajectory.reward[..., :6],
+    )
+    alone = jax.jit(agent.update)
     for lane in range(2):
-        alone = jax.jit(agent.update)(*jax.tree.map(lambda x: x[lane], args))[0]
-        for a, b in zip(*map(jax.tree.leaves, (together, alone)), strict=True):
-            np.testing.assert_allclose(a[lane], b, atol=ACROSS_PROGRAMS)
+        without = alone(*pick((state, fewer, cost[..., :6], slot, key), lane))
+        got = pick(dead, lane)
+        for a, b in zip(*map(jax.tree.leaves, (got[0], without[0])), strict=True):
+            np.testing.assert_allclose(a, b, atol=ACROSS_PROGRAMS)
+        np.testing.assert_allclose(got[1]["j_c"], without[1]["j_c"], rtol=1e-5)
 
 
 def test_policy_samples_unless_told_otherwise(make_agent):
@@ -155,8 +163,8 @@ def test_policy_samples_unless_told_otherwise(make_agent):
 
 def test_minibatches_must_divide_the_rows():
     agent = ppo_lagrangian(dataclasses.replace(SMALL, policy_minibatches=7), Sizes())
-    args = jax.tree.map(lambda leaf: leaf[0], stack_problem(agent))
-    with pytest.raises(ValueError, match="divide the 160 rows.*got 7"):
+    args = pick(stack_problem(agent), 0)
+    with pytest.raises(ValueError, match=r"divide the 160 rows.*got 7"):
         agent.update(*args)
 
 
@@ -164,28 +172,26 @@ def test_minibatches_must_divide_the_rows():
 
 
 def test_critics_learn_the_discounted_sum_to_the_bootstrap(make_agent):
-    """Obs = time; gamma small, so the rows' value is a known function of time."""
-    config = dataclasses.replace(
-        LONG_CRITICS, gamma=0.5, cost_gamma=0.25, policy_lr=1e-9
-    )
+    """Two states in turn, reward 1 on leaving the first, cost 1 always."""
+    config = dataclasses.replace(LONG_CRITICS, gamma=0.5, cost_gamma=0.25)
     sizes = Sizes(observation_size=1, action_size=1, episode_length=10)
     agent = make_agent(config, sizes)
     state = agent.init(jax.random.key(0))
-    time = jnp.arange(11) / 10
-    obs = jnp.broadcast_to(time[:, None, None], (11, 4, 1))
+    where = jnp.arange(11) % 2
+    obs = jnp.broadcast_to(where[:, None, None], (11, 4, 1)).astype(float)
     action = agent.policy(state, obs[:-1], jax.random.key(1))
-    reward = jnp.broadcast_to((jnp.arange(10) == 9)[:, None] * 1.0, (10, 4))
+    reward = 1.0 - obs[:-1, :, 0]
+    cost = jnp.ones_like(reward)
     trajectory = make_trajectory(obs, action, reward)
-    cost = jnp.ones_like(reward)  # constant: value 1 / (1 - 0.25) at every time
     update = jax.jit(agent.update)
-    for i in range(5):
+    for i in range(4):
         key = jax.random.key(i)
         state, metrics = update(state, trajectory, cost, make_slot(), key)
-    networks_value = metrics["value_loss"], metrics["cost_value_loss"]
-    # r at the last step only and a bootstrap that must satisfy nothing but itself:
-    # the fit of 10 targets by 16 tanh units, after 3000 steps
-    assert networks_value[0] < 2e-3
-    assert networks_value[1] < 2e-3
+    networks = make_networks(config, 1, 1)
+    value = networks.values(state.critic, jnp.array([[0.0], [1.0]]))
+    # V(0) = 1 + V(1) / 2, V(1) = V(0) / 2; V_c = 1 / (1 - 1/4)
+    expect = [[4 / 3, 2 / 3], [4 / 3, 4 / 3]]
+    np.testing.assert_allclose(value, expect, atol=0.02)  # 0.5^10 of the bootstrap
     assert metrics["j_c"] == pytest.approx(10.0)
 
 
@@ -214,9 +220,8 @@ PROBE = dataclasses.replace(
 
 
 def test_reward_gradient_raises_the_rewarded_action(make_agent):
-    moved, metrics = run_bandit(make_agent(PROBE, Sizes()), 12, 1e3, constrained=0.0)
+    moved, _ = run_bandit(make_agent(PROBE, Sizes()), 12, 1e3, constrained=0.0)
     assert moved[0] > 0.5
-    assert metrics[-1]["kl"] < 0.05
 
 
 def test_cost_gradient_lowers_the_costly_action(make_agent):

@@ -24,7 +24,9 @@ def multipliers(costs, limit):
         opt_state = optax.adam(CONFIG.multiplier_lr).init(p)
 
         def epoch(carry, j_c):
-            carry = update_multiplier(CONFIG, *carry, j_c, jnp.asarray(limit))
+            p, opt_state = carry
+            d = jnp.asarray(limit)
+            carry = update_multiplier(CONFIG, p, opt_state, j_c, d)
             return carry, jax.nn.softplus(carry[0])
 
         return np.asarray(jax.lax.scan(epoch, (p, opt_state), jnp.asarray(costs))[1])
@@ -36,14 +38,30 @@ def multipliers(costs, limit):
         (
             0.0,
             (30, 20, 10, 5, 0, 0, 0, 0),
-            (1.0318954, 1.0633934, 1.0928714, 1.1197265)
-            + (1.1427015, 1.1627035, 1.1803217, 1.1959683),
+            (
+                1.0318954,
+                1.0633934,
+                1.0928714,
+                1.1197265,
+                1.1427015,
+                1.1627035,
+                1.1803217,
+                1.1959683,
+            ),
         ),
         (
             -0.1,
             (30, 20, 10, 5, 0, 0, 0, 0),
-            (1.0318954, 1.0633996, 1.0929041, 1.1198145)
-            + (1.1428863, 1.1630208, 1.1808029, 1.1966418),
+            (
+                1.0318954,
+                1.0633996,
+                1.0929041,
+                1.1198145,
+                1.1428863,
+                1.1630208,
+                1.1808029,
+                1.1966418,
+            ),
         ),
         (
             25.0,
@@ -77,8 +95,14 @@ def test_decaying_violation_stalls_the_multiplier():
 
 @pytest.mark.parametrize(
     ("start", "limit", "expect"),
-    [(20, 0, 3.71), (20, -0.1, 3.94), (20, -1, 5.82)]
-    + [(4, 0, 3.71), (4, -0.1, 4.82), (4, -1, 10.70)],
+    [
+        (20, 0, 3.71),
+        (20, -0.1, 3.94),
+        (20, -1, 5.82),
+        (4, 0, 3.71),
+        (4, -0.1, 4.82),
+        (4, -1, 10.70),
+    ],
 )
 def test_negative_limits(start, limit, expect):
     got = multipliers(start * DECAY, float(limit))[-1]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
+from autocost_jax.agents import fisher
 from autocost_jax.agents.advantages import weighted_mean
 from autocost_jax.agents.networks import kl_divergence, make_networks
 from autocost_jax.agents.trust_region import (
@@ -87,9 +88,9 @@ def test_fisher_product_is_the_hessian_of_the_kl():
             return weighted_mean(kl_divergence(*old, *distribution(t)), weight)
 
         product = fisher_product(linearise(distribution, theta), weight, 0.1)
-        dense = product(jnp.eye(theta.size))
+        dense = jax.jit(product)(jnp.eye(theta.size))
         for kl in (forward, backward):
-            hessian = jax.hessian(kl)(theta) + 0.1 * jnp.eye(theta.size)
+            hessian = jax.jit(jax.hessian(kl))(theta) + 0.1 * jnp.eye(theta.size)
             # the KL's variance carries 1e-8, the product's does not
             np.testing.assert_allclose(dense, hessian, atol=1e-6)
         np.testing.assert_allclose(dense, dense.T, atol=1e-12)
@@ -98,16 +99,41 @@ def test_fisher_product_is_the_hessian_of_the_kl():
 
 def test_fisher_product_in_float32():
     theta, distribution, weight = network_problem()
-    dense = fisher_product(linearise(distribution, theta), weight, 0.1)(
-        jnp.eye(theta.size)
-    )
+    product = fisher_product(linearise(distribution, theta), weight, 0.1)
+    dense = jax.jit(product)(jnp.eye(theta.size))
     np.testing.assert_allclose(dense, dense.T, atol=1e-5)  # float32 sums
-    jacobian = jax.jacobian(distribution)(theta)
+    jacobian = jax.jit(jax.jacobian(distribution))(theta)
     mean, log_std = (np.asarray(part, np.float64) for part in jacobian)
     scale = weight[:, None] / 9 * np.exp(-2 * np.array([-0.5, 0.2, -1.0]))
     expect = np.einsum("rui,ru,ruj->ij", mean, scale, mean)
     expect += 2 * log_std.T @ log_std + 0.1 * np.eye(theta.size)
     np.testing.assert_allclose(dense, expect, atol=1e-5)  # float32 sums
+
+
+@pytest.mark.parametrize(
+    ("hidden_sizes", "blocks"), [((), 1), ((6,), 4), ((6, 5), 4), ((4, 7, 3), 1)]
+)
+def test_factored_fisher_product_equals_the_generic_one(
+    hidden_sizes, blocks, monkeypatch
+):
+    monkeypatch.setattr(fisher, "num_row_blocks", lambda rows: blocks)
+    with jax.enable_x64(True):
+        networks = make_networks(AgentConfig(hidden_sizes=hidden_sizes), 4, 3)
+        params, _ = networks.init(jax.random.key(1))
+        params["log_std"] = jnp.array([-0.5, 0.2, -1.0])
+        theta, unravel = ravel_pytree(params)
+        obs = jax.random.normal(jax.random.key(2), (12, 4))
+        weight = jnp.ones(12).at[9:].set(0.0)
+        lin = linearise(lambda t: networks.distribution(unravel(t), obs), theta)
+        z = jax.random.normal(jax.random.key(3), (2, theta.size))
+        expect = jax.jit(fisher_product(lin, weight, 0.1))(z)
+        got = jax.jit(fisher.mlp_fisher_product(params, obs, weight, 0.1))(z)
+    np.testing.assert_allclose(got, expect, atol=1e-12)  # float64 sums
+
+
+def test_row_blocks_divide_the_rows():
+    for rows in (1, 7, 160, 8000, 30_000, 30_001):
+        assert rows % fisher.num_row_blocks(rows) == 0
 
 
 def test_backtrack_takes_the_first_acceptable_candidate():

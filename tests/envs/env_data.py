@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.config import EnvConfig
@@ -40,7 +41,22 @@ def load(name: str) -> dict[str, np.ndarray]:
         return dict(file)
 
 
+def float32_bound(closest: np.ndarray) -> np.ndarray:
+    """Error allowed of a float32 lidar whose nearest target is `closest` metres away.
+
+    1e-5, plus what rounding positions of order 1 m does to the angle, 2e-7 / closest,
+    in units of one of 16 bins.
+    """
+    return 1e-5 + 5e-7 / closest
+
+
 def compile_env(config: EnvConfig) -> Compiled:
     env = make_env(config)
     functions = (env.reset, env.reset_to, env.step)
-    return Compiled(env, *(jax.jit(jax.vmap(function)) for function in functions))
+    reset, reset_to, step = (jax.jit(jax.vmap(function)) for function in functions)
+
+    def strong_step(state: EnvState, action: jax.Array) -> EnvState:
+        # A weakly typed action would compile a second time.
+        return step(state, jnp.asarray(action, state.obs.dtype))
+
+    return Compiled(env, reset, reset_to, strong_step)

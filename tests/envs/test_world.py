@@ -192,12 +192,16 @@ def test_one_substep_matches_closed_form_and_goldens():
         np.testing.assert_allclose(got_q[row], q_after, atol=1e-9)
         np.testing.assert_allclose(got_v[row], v_after, atol=1e-7)
         _, _, accelerometer, velocity = closed_form(q_after, v_after, clipped)
-        np.testing.assert_allclose(sensors["accelerometer"][row], accelerometer, atol=1e-5)
+        np.testing.assert_allclose(
+            sensors["accelerometer"][row], accelerometer, atol=1e-5
+        )
         np.testing.assert_allclose(sensors["velocimeter"][row, :2], velocity, atol=1e-7)
         np.testing.assert_allclose(sensors["gyro"][row, 2], v_after[2], atol=1e-7)
         s, k = np.sin(q_after[2]), np.cos(q_after[2])
         magnetometer = (-0.5 * s, -0.5 * k, 0)
-        np.testing.assert_allclose(sensors["magnetometer"][row], magnetometer, atol=1e-7)
+        np.testing.assert_allclose(
+            sensors["magnetometer"][row], magnetometer, atol=1e-7
+        )
 
 
 @pytest.fixture(scope="module")
@@ -282,6 +286,8 @@ def test_forward_run_and_turn_match_the_table(default_env, worlds):
         state = default_env.step(state, actions)
         q, v = np.asarray(state.data.qpos), np.asarray(state.data.qvel)
         if step in drive:
-            np.testing.assert_allclose((q[0, 0], v[0, 0]), drive[step], atol=FORWARD_RUN)
+            np.testing.assert_allclose(
+                (q[0, 0], v[0, 0]), drive[step], atol=FORWARD_RUN
+            )
         if step in turn:
             np.testing.assert_allclose((q[1, 2], v[1, 2]), turn[step], atol=FORWARD_RUN)

@@ -259,7 +259,7 @@ def update_critics(
         grads = jax.grad(loss_fn)(params, rows)
         updates, opt_state = optimizer.update(grads, opt_state)
         params = optax.apply_updates(params, updates)
-        return (params, opt_state), optax.global_norm(grads)
+        return (params, opt_state), global_norm(grads)
 
     rows = (batch.obs, jnp.column_stack([batch.target, batch.weight]))
 
@@ -274,6 +274,11 @@ def update_critics(
     keys = jax.random.split(key, config.value_passes)
     (params, opt_state), norms = jax.lax.scan(one_pass, (params, opt_state), keys)
     return params, opt_state, norms[0]
+
+
+def global_norm(tree: Any) -> jax.Array:
+    """Euclidean norm of all numbers of a pytree together."""
+    return jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)))
 
 
 def as_metrics(values: dict[str, Any]) -> Metrics:

@@ -5,6 +5,7 @@ constraint's value or by a multiplier, so that costs near zero are harmless.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -23,6 +24,7 @@ from autocost_jax.agents.base import (
     prepare_batch,
     update_critics,
 )
+from autocost_jax.agents.fisher import mlp_fisher_product
 from autocost_jax.agents.networks import (
     entropy,
     kl_divergence,
@@ -135,6 +137,7 @@ def update_policy(
     theta: jax.Array,
     batch: Batch,
     c: jax.Array,
+    product: Product | None = None,
 ) -> tuple[jax.Array, Metrics]:
     """One trust-region step with backtracking, on the full batch.
 
@@ -148,13 +151,16 @@ def update_policy(
       theta: [n] flat policy parameters.
       batch: the epoch's rows.
       c: [] cost per step above the limit.
+      product: multiplication by the damped Fisher matrix, [2, n] -> [2, n]; None
+        forms it from `distribution`.
 
     Returns:
       Parameters [n], theta itself if no candidate is accepted, and the metrics of
       `cpo`.
     """
     lin = linearise(distribution, theta)
-    product = fisher_product(lin, batch.weight, config.cg_damping)
+    if product is None:
+        product = fisher_product(lin, batch.weight, config.cg_damping)
     at = (lin.mean, lin.log_std)
     old_loss, old_cost = surrogates(at, batch)
     gradients = jax.jacrev(lambda at: jnp.stack(surrogates(at, batch)))(at)
@@ -165,7 +171,7 @@ def update_policy(
         c,
         product,
         config.target_kl,
-        lambda rhs: conjugate_gradient(product, rhs, config.cg_iterations),
+        partial(conjugate_gradient, product, num_iterations=config.cg_iterations),
     )
 
     def evaluate(theta: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -242,7 +248,12 @@ def cpo(config: AgentConfig, env: EnvSizes) -> Agent:
             def distribution(theta: jax.Array) -> Any:
                 return networks.distribution(unravel(theta), batch.obs)
 
-            theta, policy_metrics = update_policy(config, distribution, theta, batch, c)
+            product = mlp_fisher_product(
+                state.policy, batch.obs, batch.weight, config.cg_damping
+            )
+            theta, policy_metrics = update_policy(
+                config, distribution, theta, batch, c, product
+            )
             policy = unravel(theta)
             critic, critic_opt, critic_norm = update_critics(
                 config, networks, state.critic, state.critic_opt, batch, key

@@ -106,12 +106,13 @@ def make_networks(
         return policy_params, critic_params
 
     def distribution(params: Params, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        mean, log_std = policy.apply({"params": params}, obs)
-        return mean, log_std
+        output: Any = policy.apply({"params": params}, obs)
+        return output
 
     def values(params: Params, obs: jax.Array) -> jax.Array:
         def value(one: Params) -> jax.Array:
-            return jnp.squeeze(critic.apply({"params": one}, obs), -1)
+            output: Any = critic.apply({"params": one}, obs)
+            return jnp.squeeze(output, -1)
 
         return jax.vmap(value)(params)
 

@@ -19,6 +19,7 @@ from autocost_jax.agents.base import (
     EnvSizes,
     as_metrics,
     critic_optimizer,
+    global_norm,
     make_policy,
     prepare_batch,
     split_rows,
@@ -146,7 +147,7 @@ def update_policy(
         grads, distribution = jax.grad(loss_fn, has_aux=True)(params, rows)
         updates, opt_state = optimizer.update(grads, opt_state)
         new = (optax.apply_updates(params, updates), opt_state)
-        return new, (optax.global_norm(grads), distribution)
+        return new, (global_norm(grads), distribution)
 
     def one_pass(carry: Any, key: Key) -> tuple[Any, Any]:
         old, stopped = carry

@@ -1,0 +1,270 @@
+"""The main job, measured: does the search find costs that make agents safe?
+
+    python experiments/main_job.py search     # 3 seeds, paper's and random selection
+    python experiments/main_job.py baseline   # extrinsic cost only, the same budget
+    python experiments/main_job.py long       # the found costs, trained for longer
+    python experiments/main_job.py collect    # JSON and figures from the runs above
+
+Each part can be stopped and started again; finished runs are kept. Results are
+written to experiments/results/laptop/, reduced scale: nothing here is the paper's.
+"""
+
+import argparse
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from autocost_jax import intrinsic_cost, load_cost, make_env, preset
+from autocost_jax.arrays import load_arrays
+from autocost_jax.commandline import use_devices
+from autocost_jax.config import THETA_SIZE
+from autocost_jax.methods import Method, TableConfig, run_table
+from autocost_jax.store import list_stages, read_metrics, run_facts
+
+RUNS = Path("runs/main_job")
+RESULTS = Path("experiments/results/laptop")
+SEEDS = (0, 1, 2)
+SELECTIONS = ("paper", "random")
+LONG_SEEDS = (0, 1)
+LONG_EPOCHS = 125
+STEEP_HEIGHT, STEEP_MARGIN, STEEP_WIDTH = 0.1, 0.1, 0.03
+TIMID_DISTANCE = 1.0  # metres an episode
+
+
+def search_dir(selection: str, seed: int) -> Path:
+    """Where one search lives."""
+    return RUNS / f"search_{selection}_{seed}"
+
+
+def is_finished(path: Path, file: str) -> bool:
+    """Whether a run has written its last file."""
+    return (path / file).exists()
+
+
+def run_searches() -> None:
+    """The laptop preset as a user runs it, for each seed and selection."""
+    for seed in SEEDS:
+        for selection in SELECTIONS:
+            out = search_dir(selection, seed)
+            if is_finished(out, "report/index.html"):
+                continue
+            command = [sys.executable, "-m", "autocost_jax.evolve", "--out", str(out)]
+            if (out / "config.yaml").exists():
+                command.append("--resume")
+            else:
+                command += ["--seed", str(seed), "--selection", selection]
+            subprocess.run(command, check=True)
+
+
+def run_baseline() -> None:
+    """PPO-Lagrangian and CPO on the extrinsic cost alone, one stage's budget."""
+    devices = use_devices(None)
+    config = TableConfig(
+        train=preset("laptop").train,
+        methods=(
+            Method("ppo_lagrangian", "ppo_lagrangian"),
+            Method("cpo", "cpo"),
+        ),
+        seeds=tuple(range(8)),
+    )
+    run_if_needed(config, RUNS / "baseline", devices)
+
+
+def run_long() -> None:
+    """Extrinsic only, each seed's best searched cost and a steep one, for longer."""
+    devices = use_devices(None)
+    train = dataclasses.replace(
+        preset("laptop").train, num_epochs=LONG_EPOCHS, chunk_epochs=1
+    )
+    costs = {f"searched_{seed}": searched_theta(seed) for seed in SEEDS}
+    costs["steep"] = tuple(fit_steep().tolist())
+    methods = []
+    for algorithm in ("ppo_lagrangian", "cpo"):
+        methods.append(Method(f"{algorithm}_extrinsic", algorithm))
+        for name, theta in costs.items():
+            cost = "extrinsic+intrinsic"
+            methods.append(Method(f"{algorithm}_{name}", algorithm, cost, 0.0, theta))
+    config = TableConfig(train=train, methods=tuple(methods), seeds=LONG_SEEDS)
+    run_if_needed(config, RUNS / "long", devices)
+
+
+def run_if_needed(
+    config: TableConfig, path: Path, devices: Sequence[jax.Device]
+) -> None:
+    """Train a table unless that is done; continue where it was stopped."""
+    if is_finished(path, "evaluation.json"):
+        return
+    resume = (path / "config.yaml").exists()
+    run_table(config, path, resume=resume, devices=devices, num_episodes=200)
+
+
+def searched_theta(seed: int) -> tuple[float, ...]:
+    """The best cost of a search, by the paper's rule."""
+    return tuple(load_cost(search_dir("paper", seed) / "cost.npz").tolist())
+
+
+def fit_steep(num_layouts: int = 2048, steps: int = 4000) -> jax.Array:
+    """A hand-set cost: the network fitted to a steep wall around the hazards.
+
+    The target is height * sigmoid((R + margin - D) / width) at random robot places of
+    random layouts; only its shape is hand-made, the 41 parameters are regressed.
+    """
+    env = make_env("Goal-Hazard-Point")
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(7), num_layouts))
+    keys = jax.random.split(jax.random.key(8), num_layouts)
+    place = jax.random.uniform(jax.random.key(9), (num_layouts, 2), minval=-2, maxval=2)
+    layout = state.layout.replace(robot_xy=place)
+    inputs = jax.jit(jax.vmap(env.reset_to))(layout, keys).cost_inputs
+    edge = inputs.radius + STEEP_MARGIN
+    target = STEEP_HEIGHT * jax.nn.sigmoid((edge - inputs.distance) / STEEP_WIDTH)
+    optimiser = optax.adam(0.02)
+
+    def loss(theta: jax.Array) -> jax.Array:
+        cost = intrinsic_cost(theta, inputs.constraint_lidar)
+        return jnp.mean((cost - target) ** 2) / STEEP_HEIGHT**2
+
+    def body(carry, _):
+        theta, moments = carry
+        value, gradient = jax.value_and_grad(loss)(theta)
+        change, moments = optimiser.update(gradient, moments)
+        return (theta + change, moments), value
+
+    start = jax.random.normal(jax.random.key(10), (16, THETA_SIZE))
+
+    def fit(theta: jax.Array):
+        state = (theta, optimiser.init(theta))
+        (theta, _), values = jax.lax.scan(body, state, None, steps)
+        return theta, values[-1]
+
+    thetas, losses = jax.jit(jax.vmap(fit))(start)
+    return thetas[jnp.argmin(losses)]
+
+
+def bootstrap_fall(first: np.ndarray, last: np.ndarray) -> list[float]:
+    """95 % interval of mean(first) - mean(last), candidates resampled."""
+    rng = np.random.default_rng(0)
+    draws = [
+        rng.choice(first, first.size).mean() - rng.choice(last, last.size).mean()
+        for _ in range(20_000)
+    ]
+    return [float(x) for x in np.percentile(draws, [2.5, 97.5])]
+
+
+def collect_search(selection: str, seed: int) -> dict[str, Any]:
+    """Stage means and the fall of one search."""
+    path = search_dir(selection, seed)
+    stages = [load_arrays(file) for file in list_stages(path).values()]
+    rates = [row["time/env_steps_per_second"] for row in read_metrics(path)]
+    travelled = [stage["scores/distance_travelled"] for stage in stages]
+    return {
+        "seed": seed,
+        "selection": selection,
+        "cost": [stage["cost"].tolist() for stage in stages],
+        "stage_mean_cost": [float(stage["cost"].mean()) for stage in stages],
+        "stage_mean_return": [float(stage["ep_return"].mean()) for stage in stages],
+        "stage_zero": [int((stage["cost"] <= 0).sum()) for stage in stages],
+        "timid_share": [float((x < TIMID_DISTANCE).mean()) for x in travelled],
+        "fall": float(stages[0]["cost"].mean() - stages[-1]["cost"].mean()),
+        "fall_95": bootstrap_fall(stages[0]["cost"], stages[-1]["cost"]),
+        "env_steps_per_second": rates[-1],
+        "best": json.loads((path / "cost.json").read_text()),
+    }
+
+
+def collect() -> None:
+    """Write the JSON and the figures of whatever has been run."""
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    searches = [
+        collect_search(selection, seed)
+        for selection in SELECTIONS
+        for seed in SEEDS
+        if is_finished(search_dir(selection, seed), "cost.json")
+    ]
+    result: dict[str, Any] = {
+        "commands": [f"python experiments/main_job.py {p}" for p in PARTS],
+        "facts": run_facts(),
+        "preset": "laptop (reduced scale, not the paper's)",
+        "searches": searches,
+    }
+    for name in ("baseline", "long"):
+        if is_finished(RUNS / name, "evaluation.json"):
+            text = (RUNS / name / "evaluation.json").read_text()
+            result[name] = json.loads(text)["rows"]
+    (RESULTS / "main_job.json").write_text(json.dumps(result, indent=1) + "\n")
+    draw_searches(result)
+    if "long" in result:
+        draw_long(result["long"])
+    print(RESULTS / "main_job.json")
+
+
+def draw_searches(result: dict[str, Any]) -> None:
+    """Stage means of cost and return, selection against random choice."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    cost, reward = figure.subplots(1, 2)
+    for search in result["searches"]:
+        is_paper = search["selection"] == "paper"
+        style = {"color": "C0" if is_paper else "0.6", "marker": "o"}
+        label = f"{search['selection']} selection" if search["seed"] == 0 else None
+        stages = range(1, 1 + len(search["stage_mean_cost"]))
+        cost.plot(stages, search["stage_mean_cost"], label=label, **style)
+        reward.plot(stages, search["stage_mean_return"], label=label, **style)
+    if "baseline" in result:
+        level = np.mean([row["return_mean"] for row in result["baseline"]])
+        reward.axhline(level, color="k", ls=":", label="extrinsic cost only")
+        level = np.mean([row["cost_mean"] for row in result["baseline"]])
+        cost.axhline(level, color="k", ls=":", label="extrinsic cost only")
+    cost.set(xlabel="stage", ylabel="extrinsic cost an episode", ylim=(0, None))
+    reward.set(xlabel="stage", ylabel="return an episode")
+    for axes in (cost, reward):
+        axes.set_xticks(range(1, 4))
+        axes.legend(fontsize=8)
+    figure.suptitle("laptop preset: mean over candidates, 3 search seeds", fontsize=10)
+    figure.savefig(RESULTS / "searches.png", dpi=150)
+
+
+def draw_long(rows: list[dict[str, Any]]) -> None:
+    """Return against extrinsic cost of the longer runs."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    labels = sorted({row["method"] for row in rows})
+    for index, label in enumerate(labels):
+        chosen = [row for row in rows if row["method"] == label]
+        axes.errorbar(
+            [row["cost_mean"] for row in chosen],
+            [row["return_mean"] for row in chosen],
+            xerr=[row["cost_ci"] for row in chosen],
+            yerr=[row["return_ci"] for row in chosen],
+            fmt="o" if label.startswith("ppo") else "s",
+            color=f"C{index % (len(labels) // 2)}",
+            label=label,
+        )
+    axes.set_xscale("symlog", linthresh=0.1)
+    axes.set(xlabel="extrinsic cost an episode", ylabel="return an episode")
+    axes.legend(fontsize=7)
+    figure.savefig(RESULTS / "long.png", dpi=150)
+
+
+PARTS = {
+    "search": run_searches,
+    "baseline": run_baseline,
+    "long": run_long,
+    "collect": collect,
+}
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=PARTS)
+    PARTS[parser.parse_args().part]()
