@@ -10,7 +10,9 @@ from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
+from autocost_jax.agents.base import Agent, EnvSizes
 from autocost_jax.config import AgentConfig, EnvConfig, SearchConfig, TrainConfig
 from autocost_jax.costs import training_cost
 from autocost_jax.envs.env import Env
@@ -167,6 +169,47 @@ def _see(layout: Layout) -> tuple[jax.Array, jax.Array]:
 def _observe(layout: Layout, lidar: jax.Array) -> jax.Array:
     offset = layout.hazards[0] - layout.robot_xy
     return jnp.concatenate([layout.robot_xy, offset, lidar])
+
+
+class LinearState(struct.PyTreeNode):
+    """State of `linear_agent`: weights [O, U] and epochs learnt."""
+
+    weights: jax.Array
+    epochs: jax.Array
+
+
+def linear_agent(env: EnvSizes, lr: float = 1.0, broken_epoch: int = -1) -> Agent:
+    """A user's own agent, one REINFORCE step an epoch: compiles in a second.
+
+    It has no critic and weighs costs by `constrained`. In epoch `broken_epoch` it
+    loses its mind if `constrained` is above 1.
+    """
+
+    def init(key: jax.Array) -> LinearState:
+        shape = (env.observation_size, env.action_size)
+        weights = 0.1 * jax.random.normal(key, shape)
+        return LinearState(weights, jnp.zeros((), jnp.int32))
+
+    def policy(state, obs, key, deterministic=False):
+        mean = obs @ state.weights
+        noise = jax.random.normal(key, mean.shape)
+        return mean if deterministic else mean + 0.5 * noise
+
+    def update(state, trajectory, total_cost, slot, key):
+        del key
+        obs, valid = trajectory.obs[:-1], trajectory.valid
+        score = trajectory.reward - 4.0 * slot.constrained * total_cost
+        ahead = jnp.cumsum((score * valid)[::-1], axis=0)[::-1]
+        advantage = valid * (ahead - jnp.mean(ahead, axis=1, keepdims=True))
+        noise = trajectory.action - obs @ state.weights
+        gradient = jnp.einsum("tno,tnu,tn->ou", obs, noise, advantage)
+        gradient = gradient / jnp.maximum(jnp.sum(valid), 1.0)
+        breaks = (state.epochs == broken_epoch) & (slot.constrained > 1.0)
+        gradient = jnp.where(breaks, jnp.nan, gradient)
+        after = LinearState(state.weights + lr * gradient, state.epochs + 1)
+        return after, {"gradient": jnp.sqrt(jnp.sum(gradient**2))}
+
+    return Agent(init, policy, update)
 
 
 def train_config(**changes) -> TrainConfig:

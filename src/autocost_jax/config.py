@@ -7,6 +7,7 @@ the AutoCost paper nor Safety Gym settles.
 
 import dataclasses
 import math
+import numbers
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -21,11 +22,30 @@ def _require(ok: bool, name: str, allowed: str, got: Any) -> None:
         raise ValueError(f"{name} must be {allowed}, got {got!r}")
 
 
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and math.isfinite(value)
+
+
+def _require_finite(config: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        _require(_is_finite(value), name, "finite", value)
+
+
 def _require_positive(config: Any, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
-        ok = math.isfinite(value) and value > 0
-        _require(ok, name, "finite and > 0", value)
+        _require(_is_finite(value) and value > 0, name, "finite and > 0", value)
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+def _require_counts(config: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        _require(_is_integer(value) and value >= 1, name, "an integer >= 1", value)
 
 
 @dataclass(frozen=True)
@@ -68,8 +88,13 @@ class EnvConfig:
         ):
             value = getattr(self, name)
             _require(value in allowed, name, f"one of {', '.join(allowed)}", value)
-        for name in ("num_steps", "frameskip_binom_n", "lidar_num_bins", "hazards_num"):
-            _require(getattr(self, name) >= 1, name, ">= 1", getattr(self, name))
+        _require_counts(
+            self, "num_steps", "frameskip_binom_n", "lidar_num_bins", "hazards_num"
+        )
+        _require_finite(self, "hazards_cost", "reward_distance", "reward_goal")
+        margin = self.placements_margin
+        ok = _is_finite(margin) and margin >= 0
+        _require(ok, "placements_margin", "finite and >= 0", margin)
         _require_positive(
             self,
             "goal_size",
@@ -85,9 +110,9 @@ class EnvConfig:
         x0, y0, x1, y1 = self.placements_extents
         wide = 2 * max(self.robot_keepout, self.goal_keepout, self.hazards_keepout)
         _require(
-            x1 - x0 > wide and y1 - y0 > wide,
+            wide < x1 - x0 < math.inf and wide < y1 - y0 < math.inf,
             "placements_extents",
-            f"(xmin, ymin, xmax, ymax), more than {wide} m wide and high",
+            f"(xmin, ymin, xmax, ymax), finite, more than {wide} m wide and high",
             self.placements_extents,
         )
 
@@ -129,19 +154,20 @@ class AgentConfig:
     backtrack_ratio: float = 0.8
 
     def __post_init__(self) -> None:
-        for name in (
+        _require_counts(
+            self,
             "policy_passes",
             "policy_minibatches",
             "value_passes",
             "value_minibatches",
             "cg_iterations",
             "backtrack_steps",
-        ):
-            _require(getattr(self, name) >= 1, name, ">= 1", getattr(self, name))
+        )
+        _require_finite(self, "log_std_init")
         _require(
-            all(size >= 1 for size in self.hidden_sizes),
+            all(_is_integer(size) and size >= 1 for size in self.hidden_sizes),
             "hidden_sizes",
-            "a tuple of sizes >= 1",
+            "a tuple of integers >= 1",
             self.hidden_sizes,
         )
         for name in ("gamma", "cost_gamma"):
@@ -183,8 +209,9 @@ class TrainConfig:
     chunk_epochs: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("num_worlds", "segments_per_episode", "num_epochs"):
-            _require(getattr(self, name) >= 1, name, ">= 1", getattr(self, name))
+        _require_counts(
+            self, "num_worlds", "segments_per_episode", "num_epochs", "chunk_epochs"
+        )
         k, steps = self.segments_per_episode, self.env.num_steps
         _require(
             steps % k == 0, "segments_per_episode", f"a divisor of num_steps={steps}", k
@@ -200,7 +227,7 @@ class TrainConfig:
             )
         chunk = self.chunk_epochs
         _require(
-            chunk >= 1 and self.num_epochs % chunk == 0,
+            self.num_epochs % chunk == 0,
             "chunk_epochs",
             f"a divisor of num_epochs={self.num_epochs}",
             chunk,
@@ -214,7 +241,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """The evolutionary search; the defaults are the paper's, or ours where it is silent.
+    """The evolutionary search; defaults are the paper's, or ours where it is silent.
 
     Ours: `init_std` 1 (the paper: "randomly sample"), 7 stages, each child mutated
     additively or multiplicatively with probability 1/2, factors element-wise uniform
@@ -240,17 +267,18 @@ class SearchConfig:
     selection: Selection = "paper"
 
     def __post_init__(self) -> None:
+        _require_counts(
+            self, "population_size", "num_elites", "num_stages", "fitness_epochs"
+        )
         size = self.population_size
-        _require(size >= 1, "population_size", ">= 1", size)
         _require(
-            1 <= self.num_elites <= size,
+            self.num_elites <= size,
             "num_elites",
             f"in [1, population_size={size}]",
             self.num_elites,
         )
-        _require(self.num_stages >= 1, "num_stages", ">= 1", self.num_stages)
         _require(
-            1 <= self.fitness_epochs <= max(1, self.train.num_epochs // 3),
+            self.fitness_epochs <= max(1, self.train.num_epochs // 3),
             "fitness_epochs",
             f"in [1, num_epochs={self.train.num_epochs} // 3]",
             self.fitness_epochs,
@@ -264,11 +292,15 @@ class SearchConfig:
             f"distinct names out of {', '.join(known)}",
             self.algorithms,
         )
-        _require_positive(self, "init_std", "mutation_std", "mutation_low")
+        _require_positive(
+            self, "init_std", "mutation_std", "mutation_low", "mutation_high"
+        )
+        _require_finite(self, "cost_limit")
         low, high = self.mutation_low, self.mutation_high
         _require(high >= low, "mutation_high", f">= mutation_low={low}", high)
         tolerance = self.zero_tolerance
-        _require(tolerance >= 0, "zero_tolerance", ">= 0", tolerance)
+        ok = _is_finite(tolerance) and tolerance >= 0
+        _require(ok, "zero_tolerance", "finite and >= 0", tolerance)
         selections = ("paper", "random")
         _require(
             self.selection in selections,
@@ -276,8 +308,8 @@ class SearchConfig:
             f"one of {', '.join(selections)}",
             self.selection,
         )
-        _require(0 <= self.seed < 2**32, "seed", "in [0, 2**32)", self.seed)
-        _require(math.isfinite(self.cost_limit), "cost_limit", "finite", self.cost_limit)
+        ok = _is_integer(self.seed) and 0 <= self.seed < 2**32
+        _require(ok, "seed", "an integer in [0, 2**32)", self.seed)
 
     @property
     def env_steps(self) -> int:
@@ -319,8 +351,12 @@ PRESETS: dict[str, SearchConfig] = {
         train=TrainConfig(
             env=EnvConfig(num_steps=50),
             agent=dataclasses.replace(
-                _LAPTOP_AGENT, hidden_sizes=(16, 16), policy_passes=2, value_passes=2,
-                policy_minibatches=2, value_minibatches=2,
+                _LAPTOP_AGENT,
+                hidden_sizes=(16, 16),
+                policy_passes=2,
+                value_passes=2,
+                policy_minibatches=2,
+                value_minibatches=2,
             ),
             num_worlds=2,
             num_epochs=2,

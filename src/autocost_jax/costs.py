@@ -8,6 +8,7 @@ passing a longer bank.
 """
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from autocost_jax.arrays import load_arrays
 from autocost_jax.config import LIDAR_BINS, THETA_SIZE
 from autocost_jax.records import CostInputs, TrainingCost
 
@@ -145,8 +147,8 @@ def training_cost(
       bank: the cost terms that `method` may name.
 
     Raises:
-      ValueError: unknown term (the message lists the bank), bad weight, or no theta
-        although the method uses the network.
+      ValueError: unknown term (the message lists the bank), bad weight, theta of
+        another shape, or no theta although the method uses the network.
     """
     names = [term.name for term in bank]
     weights = np.zeros(len(bank), np.float32)
@@ -160,15 +162,21 @@ def training_cost(
         try:
             weight = float(factor) if factor else 1.0
         except ValueError:
+            weight = math.nan
+        if not math.isfinite(weight):
             raise ValueError(
-                f"weight {factor!r} in method {method!r} must be a number"
-            ) from None
+                f"weight {factor!r} in method {method!r} must be a finite number"
+            )
         weights[names.index(name.strip())] += weight
     if theta is None:
         uses_network = "intrinsic" in names and weights[names.index("intrinsic")] != 0
         if uses_network:
-            raise ValueError(f"method {method!r} needs the parameters of a cost (theta)")
+            raise ValueError(
+                f"method {method!r} needs the parameters of a cost (theta)"
+            )
         theta = np.zeros(THETA_SIZE, np.float32)
+    if np.shape(theta) != (THETA_SIZE,):
+        raise ValueError(f"theta must have shape [{THETA_SIZE}], got {np.shape(theta)}")
     return TrainingCost(
         weights=jnp.asarray(weights),
         theta=jnp.asarray(theta, jnp.float32),
@@ -179,11 +187,16 @@ def training_cost(
 def save_cost(
     path: str | Path, theta: jax.Array | np.ndarray, card: Mapping[str, Any]
 ) -> None:
-    """Write `<path>.npz` (theta [41], float32) and `<path>.json` (its card)."""
-    path = Path(path).with_suffix("")
-    np.savez(path.with_suffix(".npz"), theta=np.asarray(theta, np.float32))
+    """Write `<path>.npz` (theta [41], float32) and `<path>.json` (its card).
+
+    Raises:
+      ValueError: if theta is not 41 finite numbers, or the card not JSON.
+    """
+    file, theta = _cost_file(path), np.asarray(theta, np.float32)
+    _check_theta(file, theta)
     text = json.dumps(dict(card), indent=2, allow_nan=False)
-    path.with_suffix(".json").write_text(text + "\n")
+    np.savez(file, theta=theta)
+    file.with_suffix(".json").write_text(text + "\n")
 
 
 def load_cost(path: str | Path) -> jax.Array:
@@ -192,15 +205,23 @@ def load_cost(path: str | Path) -> jax.Array:
     Raises:
       ValueError: if the file is missing or is not a cost: one line naming it.
     """
-    file = Path(path).with_suffix(".npz")
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            theta = archive["theta"]
-    except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{file} is not a readable cost file: {error}") from None
-    if theta.shape != (THETA_SIZE,) or not np.isfinite(theta).all():
-        raise ValueError(
-            f"{file} must hold theta with {THETA_SIZE} finite numbers, "
-            f"got shape {theta.shape}"
-        )
+    file = _cost_file(path)
+    theta = np.asarray(load_arrays(file).get("theta", ()))
+    _check_theta(file, theta)
     return jnp.asarray(theta, jnp.float32)
+
+
+def _check_theta(file: Path, theta: np.ndarray) -> None:
+    is_theta = theta.shape == (THETA_SIZE,) and theta.dtype.kind in "fiu"
+    if not is_theta or not np.isfinite(theta).all():
+        raise ValueError(
+            f"{file}: theta must be {THETA_SIZE} finite numbers, "
+            f"got {theta.dtype}{list(theta.shape)}"
+        )
+
+
+def _cost_file(path: str | Path) -> Path:
+    """`<path>.npz`, unless the path already says so; other dots belong to the name."""
+    path = Path(path)
+    name = path.stem if path.suffix in (".npz", ".json") else path.name
+    return path.with_name(f"{name}.npz")

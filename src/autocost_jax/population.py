@@ -26,6 +26,8 @@ from autocost_jax.records import EvalResult, Key, Metrics, Slot, TrainingCost
 from autocost_jax.train import Learner, init_learner, run_epoch
 
 AXIS = "slot"
+# It runs once a stage: compiling it took 11 s at level 3 and 2 s at level 1.
+INIT_OPTIONS = {"xla_backend_optimization_level": 1}
 AGENTS: dict[str, Callable[..., Agent]] = {"ppo_lagrangian": ppo_lagrangian, "cpo": cpo}
 
 
@@ -104,7 +106,10 @@ def make_population(
     agents, bank = tuple(agents), tuple(bank)
     mesh = Mesh(np.asarray(devices or jax.devices()[:1]), (AXIS,))
     chunk_fn = _chunk_fn(env, agents, config, bank, mesh)
-    init_fn = jax.jit(_sharded(lambda slots: _init(agents, slots), mesh, P(AXIS)))
+    init_fn = jax.jit(
+        _sharded(lambda slots: _init(agents, slots), mesh, P(AXIS)),
+        compiler_options=INIT_OPTIONS if mesh.devices.flat[0].platform == "cpu" else {},
+    )
     compiled: dict[str, Any] = {}
 
     def init(slots: tuple[Slot, ...]) -> tuple[Learner, ...]:

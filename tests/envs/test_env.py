@@ -171,7 +171,7 @@ def test_dense_cost_inside_a_hazard(default_env, worlds):
 
 
 def on_goal(worlds):
-    """Every world with its robot standing on its goal, and its reward starting there."""
+    """Every robot standing on its goal, with the next reward starting there."""
     yaw = jnp.zeros((NUM_WORLDS, 1))
     qpos = jnp.concatenate([worlds.layout.goal_xy, yaw], -1)
     distances = jnp.zeros_like(worlds.task_distances)

@@ -1,12 +1,16 @@
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-import mujoco
+import mujoco as untyped_mujoco
 import numpy as np
 import pytest
 from env_data import NUM_WORLDS, load
 
 from autocost_jax.config import EnvConfig
 from autocost_jax.envs.world import load_spec, make_world
+
+mujoco: Any = untyped_mujoco  # its compiled names have no stubs
 
 TABLE = 1e-9  # numbers printed with nine decimals
 FLOAT64 = 1e-9  # float64 against float64; MuJoCo's own versions differ by 1e-13
@@ -25,7 +29,7 @@ def constants():
     return load("model_constants")
 
 
-def c_model(floor: bool) -> mujoco.MjModel:
+def c_model(floor: bool) -> Any:
     spec = load_spec("Point")
     if floor:
         plane = mujoco.mjtGeom.mjGEOM_PLANE
@@ -61,7 +65,7 @@ def test_constants_match_safety_gym(constants, name):
 
 def test_inertia_geoms_and_servo_match_safety_gym(constants):
     model = c_model(floor=True)
-    # MuJoCo sorts principal inertias; the frame that goes with them is tested by motion.
+    # MuJoCo sorts principal inertias; their frame is tested by the motion.
     got = np.sort(model.body_inertia)
     np.testing.assert_allclose(got, np.sort(constants["Point_body_inertia"]), rtol=1e-9)
     # Biases beyond the third entry are unused.

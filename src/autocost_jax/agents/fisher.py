@@ -98,7 +98,11 @@ def mlp_fisher_product(
                 for y, d in zip(pushed, derivatives, strict=False)
             ]
             mean = scale[:, None] * sum(hidden, pushed[-1])  # [r, K, U]
-            pulled = [jnp.sum(mean[..., None] * d[:, None], 2) for d in derivatives]
+            # Sums over the few outputs written out: they fuse, a reduction does not.
+            pulled = [
+                sum(mean[:, :, i, None] * d[:, None, i] for i in range(d.shape[1]))
+                for d in derivatives
+            ]
             pulled = [p.reshape(p.shape[0], -1) for p in (*pulled, mean)]
             new = [
                 (x @ p, jnp.sum(p, axis=0))

