@@ -111,9 +111,7 @@ def test_a_method_is_a_weighted_sum():
     cost = training_cost("extrinsic+0.1*safety_margin_2x + -2*distance_change")
     expected = np.array(TERMS["extrinsic"]) + 0.1 * np.array(TERMS["safety_margin_2x"])
     expected -= 2.0 * np.array(TERMS["distance_change"])
-    np.testing.assert_allclose(
-        total_cost(cost, make_inputs()), expected, atol=ROUNDING
-    )
+    np.testing.assert_allclose(total_cost(cost, make_inputs()), expected, atol=ROUNDING)
 
 
 def test_a_term_named_twice_counts_twice():

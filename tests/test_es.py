@@ -141,7 +141,7 @@ def split_by_kind(key, num_children=2000, size=50, **options):
     sign = jnp.where(jnp.arange(size) % 2 == 0, 1.0, -1.0)
     children = np.asarray(jit_mutate(key, 100.0 * sign[None], num_children, **options))
     ratio = children / (100.0 * np.asarray(sign))
-    # Noise of a few units leaves 100 within 20 %; of 50 factors in [0.5, 2] some do not.
+    # Noise of a few units keeps 100 within 20 %; not so 50 factors in [0.5, 2].
     additive = np.abs(ratio - 1.0).max(axis=1) < 0.2
     noise = children[additive] - 100.0 * np.asarray(sign)
     return additive, noise, ratio[~additive]

@@ -4,8 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import NUM_STEPS, RADIUS, intrinsic_slots, linear_agent, make_toy_env
-from toys import train_config as make_config
 
 from autocost_jax.rollout import (
     carry_cohorts,
@@ -14,6 +12,8 @@ from autocost_jax.rollout import (
     unroll,
 )
 from autocost_jax.train import init_learner, init_worlds, run_epoch
+from toys import NUM_STEPS, RADIUS, intrinsic_slots, linear_agent, make_toy_env
+from toys import train_config as make_config
 
 NUM_WORLDS = 3
 ROUNDING = 1e-6  # the same formula stepped in another program

@@ -99,7 +99,7 @@ def mlp_fisher_product(
             ]
             mean = scale[:, None] * sum(hidden, pushed[-1])  # [r, K, U]
             # Sums over the few outputs written out: they fuse, a reduction does not.
-            pulled = [
+            pulled: list[Any] = [
                 sum(mean[:, :, i, None] * d[:, None, i] for i in range(d.shape[1]))
                 for d in derivatives
             ]

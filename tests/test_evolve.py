@@ -1,0 +1,258 @@
+"""The main job from its command line: whole, killed, resumed, and misused."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import autocost_jax
+from autocost_jax import evolve as evolve_module
+from autocost_jax.config import preset
+from autocost_jax.evolve import main
+from autocost_jax.store import RunDirError, list_stages, read_config, read_metrics
+from autocost_jax.summary import load_report
+
+SMOKE = ["--preset", "smoke", "--eval-episodes", "4", "--seed", "3"]
+WAIT = 400  # seconds until a subprocess counts as hung; they take 10 to 60
+
+
+def command(out: Path, *flags: str) -> list[str]:
+    words = [sys.executable, "-m", "autocost_jax.evolve", "--out", str(out)]
+    return [*words, *flags]
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """Subprocesses share a compilation cache: cold for the first, then warm."""
+    cache = tmp_path_factory.mktemp("cache")
+    return os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, environment):
+    """A smoke run from start to end, with a cold cache."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    done = subprocess.run(
+        command(out, *SMOKE), env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return out, done.stdout
+
+
+def without_time(path: Path) -> list[dict]:
+    return [
+        {name: value for name, value in row.items() if not name.startswith("time/")}
+        for row in read_metrics(path)
+    ]
+
+
+def test_a_run_leaves_everything_the_readme_names(whole):
+    out, text = whole
+    for name in (
+        "config.yaml",
+        "metrics.jsonl",
+        "checkpoints",
+        "stage_00.npz",
+        "stage_01.npz",
+        "cost.npz",
+        "cost.json",
+        "policies/stage_01_cpo.npz",
+        "policies/stage_01_ppo_lagrangian.npz",
+        "report/index.html",
+        "tensorboard",
+    ):
+        assert (out / name).exists(), name
+    assert list((out / "tensorboard").iterdir())
+    assert (out / "stage_01.npz").stat().st_size < 100_000
+    for word in ("compiled in", "stage 2/2", "epoch 2/2", "at zero", "time left"):
+        assert word in text
+    config, facts = read_config(out)
+    assert config.seed == 3
+    assert facts["versions"]["jax"]
+    assert autocost_jax.load_cost(out / "cost.npz").shape == (41,)
+
+
+def test_metrics_have_one_row_an_epoch_with_every_slot(whole):
+    out, _ = whole
+    rows = read_metrics(out)
+    config = preset("smoke")
+    assert [(row["stage"], row["epoch"]) for row in rows] == [
+        (stage, epoch)
+        for stage in range(config.num_stages)
+        for epoch in range(config.train.num_epochs)
+    ]
+    for row in rows:
+        for name in config.algorithms:
+            assert len(row[f"{name}/ep_cost"]) == config.population_size
+
+
+def test_the_card_names_the_best_of_all_stages(whole):
+    out, _ = whole
+    card = json.loads((out / "cost.json").read_text())
+    stages = [np.load(file) for file in list_stages(out).values()]
+    cost = np.stack([stage["cost"] for stage in stages])
+    ep_return = np.stack([stage["ep_return"] for stage in stages])
+    zero = cost <= 0
+    if zero.any():
+        expected = np.unravel_index(
+            np.argmax(np.where(zero, ep_return, -np.inf)), cost.shape
+        )
+        assert card["label"] == "zero violation, highest return"
+    else:
+        expected = np.unravel_index(np.argmin(cost), cost.shape)
+        assert card["label"] == "lowest cost"
+    assert (card["stage"], card["index"]) == expected
+    theta = autocost_jax.load_cost(out / "cost.npz")
+    np.testing.assert_array_equal(theta, stages[card["stage"]]["theta"][card["index"]])
+
+
+def test_the_report_is_made_of_the_run(whole):
+    out, _ = whole
+    data = load_report(out)
+    assert len(data.stages) == 2
+    assert data.replay is not None
+    assert {row.episodes for row in data.evaluations} == {4}
+    page = (out / "report" / "index.html").read_text()
+    assert "Goal-Hazard-Point" in page
+
+
+def test_killed_and_resumed_is_bit_for_bit_the_same(whole, environment, tmp_path):
+    reference, _ = whole
+    out = tmp_path / "killed"
+    process = subprocess.Popen(
+        command(out, *SMOKE), env=environment, stdout=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + WAIT
+    while not list(out.glob("checkpoints/step_*")):  # at least one epoch is safe
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    was_finished = (out / "cost.json").exists()
+    done = subprocess.run(
+        command(out, "--resume", "--eval-episodes", "4"),
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert not was_finished
+    assert "resuming" in done.stdout
+    assert without_time(out) == without_time(reference)
+    for name in ("stage_00.npz", "stage_01.npz", "cost.npz", "replay.npz"):
+        a, b = np.load(reference / name), np.load(out / name)
+        assert sorted(a.files) == sorted(b.files)
+        for key in a.files:
+            np.testing.assert_array_equal(a[key], b[key], err_msg=f"{name} {key}")
+    card = (out / "cost.json").read_text()
+    assert card == (reference / "cost.json").read_text()
+
+
+def bad(capsys, *argv: str) -> str:
+    """The one line that a bad command line gets."""
+    with pytest.raises(SystemExit) as stop:
+        main(list(argv))
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    return error
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--preset", "huge"], ["huge", "laptop", "paper"]),
+        (["--env", "Goal-Hazard-Cat"], ["Goal-Hazard-Cat", "Goal-Hazard-Point"]),
+        (["--colour", "red"], ["--colour"]),
+        (["--population-size", "1"], ["num_elites", "population_size=1"]),
+        (["--num-worlds", "many"], ["--num-worlds", "many"]),
+        (["--num-epochs", "0"], ["num_epochs"]),
+        (["--selection", "best"], ["--selection", "paper", "random"]),
+        (["--devices", "99"], ["devices", "99"]),
+    ],
+)
+def test_bad_flags_get_one_line_and_status_2(capsys, tmp_path, flags, words):
+    error = bad(capsys, *flags, "--out", str(tmp_path / "run"))
+    for word in words:
+        assert word in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_resume_with_another_config_names_the_difference(capsys, whole):
+    out, _ = whole
+    before = (out / "metrics.jsonl").read_bytes()
+    error = bad(capsys, "--out", str(out), "--resume", "--seed", "4")
+    assert "seed=3" in error
+    assert "seed=4" in error
+    assert (out / "metrics.jsonl").read_bytes() == before
+
+
+def test_a_run_is_not_overwritten_by_accident(capsys, whole):
+    out, _ = whole
+    before = (out / "metrics.jsonl").read_bytes()
+    assert "already holds a run" in bad(capsys, *SMOKE, "--out", str(out))
+    assert (out / "metrics.jsonl").read_bytes() == before
+
+
+def test_foreign_and_unreadable_directories_are_refused(capsys, tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    assert "not empty" in bad(capsys, *SMOKE, "--out", str(tmp_path))
+    assert "not a run" in bad(capsys, "--resume", "--out", str(tmp_path))
+    assert (tmp_path / "thesis.txt").read_text() == "mine"
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "config.yaml").write_text("a: [")
+    assert "not readable" in bad(capsys, "--resume", "--out", str(broken))
+
+
+def test_dry_run_says_what_would_happen_and_writes_nothing(capsys, tmp_path):
+    main(["--preset", "smoke", "--dry-run", "--out", str(tmp_path / "run")])
+    text = capsys.readouterr().out
+    assert f"{preset('smoke').env_steps:,} env steps" in text
+    assert "memory" in text
+    assert not (tmp_path / "run").exists()
+
+
+def test_help_lists_the_flags(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code in (0, None)
+    text = capsys.readouterr().out
+    for flag in ("--preset", "--env", "--out", "--resume", "--devices", "--dry-run"):
+        assert flag in text
+
+
+def test_config_of_a_run_can_be_used_for_another(whole, tmp_path, capsys):
+    out, _ = whole
+    new = tmp_path / "new"
+    main(["--config", str(out), "--num-stages", "1", "--dry-run", "--out", str(new)])
+    assert "1 stages of 4 candidates" in capsys.readouterr().out
+
+
+def test_the_module_is_the_function_too():
+    # `import autocost_jax.evolve` binds the module to the name of the function.
+    assert callable(evolve_module)
+    assert callable(autocost_jax.evolve)
+
+
+def test_config_yaml_is_plain_yaml(whole):
+    out, _ = whole
+    document = yaml.safe_load((out / "config.yaml").read_text())
+    assert document["config"]["population_size"] == 4
+
+
+def test_read_config_of_nothing_is_one_line(tmp_path):
+    with pytest.raises(RunDirError, match="not a run directory"):
+        read_config(tmp_path / "nothing")

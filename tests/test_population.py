@@ -1,0 +1,303 @@
+"""One program for all slots: what is equal to what, one trace, any device count."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from autocost_jax import population as population_lib
+from autocost_jax.population import (
+    candidate_slots,
+    make_agents,
+    make_evaluator,
+    make_population,
+    stack_slots,
+)
+from toys import TRAIN, Counter, intrinsic_slots, make_toy_env, train_config
+
+ALGORITHMS = ("ppo_lagrangian", "cpo")
+SIZE, MORE = 4, 8  # slots a group
+EPOCHS = 3
+ONE_UPDATE = 1e-5  # across programs: sums of float32 in another order, one update
+SAME_SIZE = 0.01  # of the program's instruction counts
+
+
+@pytest.fixture(scope="module")
+def counter():
+    return Counter()
+
+
+@pytest.fixture(scope="module")
+def program(counter):
+    """The population program of both algorithms on the toy environment."""
+    env = make_toy_env(counter=counter)
+    agents = make_agents(ALGORITHMS, TRAIN, env)
+    return make_population(env, agents, TRAIN)
+
+
+def run(program, slots, learners=None, epochs=EPOCHS):
+    """Learners and metrics [E, P] of each group after some epochs, as NumPy."""
+    learners = program.init(slots) if learners is None else learners
+    rows = []
+    for epoch in range(epochs):
+        learners, metrics = program.chunk(learners, slots, epoch)
+        rows.append(metrics)
+    metrics = jax.tree.map(lambda *x: np.concatenate(x), *rows)
+    return jax.tree.map(np.asarray, learners), metrics
+
+
+def groups(size=SIZE):
+    return (intrinsic_slots(size, seed=0), intrinsic_slots(size, seed=1))
+
+
+def lanes(result, index):
+    """Some slots of a result, learners [P] and metrics [E, P] alike."""
+    learners, metrics = result
+    return (
+        jax.tree.map(lambda x: x[index], learners),
+        jax.tree.map(lambda x: x[:, index], metrics),
+    )
+
+
+def assert_same_bits(one, two):
+    assert jax.tree.structure(one) == jax.tree.structure(two)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def assert_close(one, two, atol):
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+        np.testing.assert_allclose(a, b, rtol=atol, atol=atol)
+
+
+@pytest.fixture(scope="module")
+def reference(program):
+    return run(program, groups())
+
+
+# Within one program: the same bits ---------------------------------------------
+
+
+def test_slots_learn_different_things(reference):
+    """Without this the equalities below would say nothing."""
+    learners, metrics = reference
+    for group, rows in zip(learners, metrics, strict=True):
+        kernel = jax.tree.leaves(group.agent.policy)[0].reshape(SIZE, -1)
+        assert len(np.unique(kernel, axis=0)) == SIZE
+        assert len(np.unique(rows["ep_total_cost"][-1])) == SIZE
+        assert not group.frozen.any()
+
+
+def test_the_same_seed_twice(program, reference):
+    assert_same_bits(run(program, groups()), reference)
+
+
+def test_permuted_slots(program, reference):
+    order = np.array([2, 0, 3, 1])
+    permuted = run(program, jax.tree.map(lambda x: x[order], groups()))
+    assert_same_bits(permuted, lanes(reference, order))
+
+
+def poison_theta(slots, learners):
+    cost = slots[0].cost
+    theta = cost.theta.at[1].set(jnp.nan)
+    return (slots[0].replace(cost=cost.replace(theta=theta)), slots[1]), learners
+
+
+def poison_parameters(slots, learners):
+    def poison(learner):
+        policy = learner.agent.policy
+        log_std = policy["log_std"].at[1].set(jnp.nan)
+        agent = learner.agent.replace(policy=policy | {"log_std": log_std})
+        return learner.replace(agent=agent)
+
+    return slots, tuple(poison(learner) for learner in learners)
+
+
+@pytest.mark.parametrize("poison", [poison_theta, poison_parameters])
+def test_a_nan_neighbour(program, reference, poison):
+    slots, learners = poison(groups(), program.init(groups()))
+    sick = run(program, slots, learners)
+    healthy = np.array([0, 2, 3])
+    assert_same_bits(lanes(sick, healthy), lanes(reference, healthy))
+    frozen = [group.frozen[1] for group in sick[0]]
+    assert frozen == [True, poison is poison_parameters]
+    assert sick[0][0].frozen_epoch.tolist() == [-1, 0, -1, -1]
+    assert (sick[1][0]["frozen"][:, 1] == 1.0).all()
+
+
+def test_other_contents_of_the_other_slots(program, reference):
+    mixed = jax.tree.map(
+        lambda own, other: own.at[1:].set(other[1:]),
+        groups(),
+        (intrinsic_slots(SIZE, seed=7), intrinsic_slots(SIZE, seed=8)),
+    )
+    assert_same_bits(lanes(run(program, mixed), 0), lanes(reference, 0))
+
+
+def test_a_group_does_not_see_the_other(program, reference):
+    other = run(program, (groups()[0], intrinsic_slots(SIZE, seed=9)))
+    assert_same_bits((other[0][0], other[1][0]), (reference[0][0], reference[1][0]))
+    assert not np.array_equal(other[1][1]["ep_return"], reference[1][1]["ep_return"])
+
+
+# Across programs: one update, rounding apart ------------------------------------
+
+
+@pytest.fixture(scope="module")
+def wide():
+    """The same program for twice as many slots: its compilation, and one epoch."""
+    env = make_toy_env()
+    program = make_population(env, make_agents(ALGORITHMS, TRAIN, env), TRAIN)
+    slots = jax.tree.map(
+        lambda one, two: jnp.concatenate([one, two]), groups(), groups()[::-1]
+    )
+    learners = program.init(slots)
+    text = program.compile(learners, slots).as_text()
+    return text, run(program, slots, learners, epochs=1)
+
+
+def test_another_population_size(program, wide):
+    first = run(program, groups(), epochs=1)
+    assert_close(lanes(wide[1], slice(0, SIZE)), first, ONE_UPDATE)
+
+
+def count_instructions(text):
+    return sum(" = " in line for line in text.splitlines())
+
+
+def test_the_size_of_the_program_is_not_the_populations(program, wide):
+    slots = groups()
+    text = program.compile(program.init(slots), slots).as_text()
+    count, wide_count = count_instructions(text), count_instructions(wide[0])
+    assert count > 1000
+    assert abs(wide_count - count) <= SAME_SIZE * count
+
+
+def test_the_physics_is_traced_once_for_both_algorithms(program, reference, counter):
+    del program, reference
+    assert counter.steps == 1
+
+
+# Devices ------------------------------------------------------------------------
+
+SCRIPT = """
+import json, re, sys
+sys.path.insert(0, {tests!r})
+import jax
+import numpy as np
+from test_population import ALGORITHMS, groups, run
+from toys import TRAIN, make_toy_env
+from autocost_jax.arrays import flatten
+from autocost_jax.population import make_agents, make_population
+
+jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_num_cpu_devices", 3)
+collectives = {{}}
+for count in (1, 2, 3):
+    env = make_toy_env()
+    devices = jax.devices()[:count]
+    program = make_population(
+        env, make_agents(ALGORITHMS, TRAIN, env), TRAIN, devices=devices
+    )
+    assert program.num_devices == count
+    slots = groups(3)
+    learners = program.init(slots)
+    text = program.compile(learners, slots).as_text()
+    names = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"
+    collectives[count] = sorted(set(re.findall(names, text)))
+    result = run(program, slots, learners, epochs=1)
+    np.savez({out!r} + f"/{{count}}.npz", **flatten(result))
+print(json.dumps(collectives))
+"""
+
+
+@pytest.fixture(scope="module")
+def devices(tmp_path_factory):
+    """Three slots on 1, 2 (padded) and 3 devices: collectives found, and results.
+
+    In a process of its own, because a CPU is split into devices once; and without
+    LLVM's optimisations, which see neither the partition nor a collective.
+    """
+    out = tmp_path_factory.mktemp("devices")
+    script = SCRIPT.format(tests=str(Path(__file__).parent), out=str(out))
+    flags = "--xla_backend_optimization_level=0"
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    results = {
+        count: dict(np.load(out / f"{count}.npz", allow_pickle=False))
+        for count in (1, 2, 3)
+    }
+    return json.loads(done.stdout.splitlines()[-1]), results
+
+
+def test_devices_do_not_talk(devices):
+    assert devices[0] == {"1": [], "2": [], "3": []}
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_any_number_of_devices_gives_the_same_numbers(devices, count):
+    one, many = devices[1][1], devices[1][count]
+    assert one.keys() == many.keys()
+    for name, value in one.items():
+        assert value.shape == many[name].shape
+        np.testing.assert_allclose(
+            many[name], value, rtol=ONE_UPDATE, atol=ONE_UPDATE, err_msg=name
+        )
+
+
+# The face of it -----------------------------------------------------------------
+
+
+def test_segments_are_refused():
+    env = make_toy_env()
+    config = train_config(segments_per_episode=2)
+    agents = make_agents(ALGORITHMS, config, env)
+    with pytest.raises(ValueError, match="segments_per_episode must be 1 .* got 2"):
+        make_population(env, agents, config)
+
+
+def test_candidates_share_their_random_numbers(key):
+    slots = candidate_slots(groups()[0].cost, key)
+    assert slots.key.shape == slots.constrained.shape == (SIZE,)
+    assert len(np.unique(jax.random.key_data(slots.key), axis=0)) == 1
+    assert (slots.constrained == 1.0).all()
+
+
+def test_stacking_is_undone_by_indexing():
+    slots = intrinsic_slots(3)
+    parts = [jax.tree.map(lambda x, i=i: x[i], slots) for i in range(3)]
+    again = stack_slots(parts)
+    np.testing.assert_array_equal(
+        jax.random.key_data(again.key), jax.random.key_data(slots.key)
+    )
+    assert_same_bits(again.cost, slots.cost)
+
+
+def test_the_evaluator_plays_the_same_layouts_for_all(key, reference):
+    env = make_toy_env()
+    agent = make_agents(ALGORITHMS[:1], TRAIN, env)[0]
+    states = reference[0][0].agent
+    result, episodes = make_evaluator(env, agent, 5)(states, key)
+    assert result.ep_return.shape == (SIZE, 5)
+    assert episodes.robot_xy.shape == (SIZE, env.episode_length, 5, 2)
+    start = np.asarray(episodes.start.robot_xy)
+    assert (start == start[:1]).all()
+    assert len(np.unique(start[0], axis=0)) == 5
+    assert len(np.unique(result.ep_return[:, 0])) == SIZE
+
+
+def test_only_this_module_names_the_algorithms():
+    assert set(population_lib.AGENTS) == set(ALGORITHMS)
