@@ -25,6 +25,8 @@ ALGORITHMS = ("ppo_lagrangian", "cpo")
 SIZE, MORE = 4, 8  # slots a group
 EPOCHS = 3
 ONE_UPDATE = 1e-5  # across programs: sums of float32 in another order, one update
+DOUBLE = 1e-7  # the same in float64, CPO's solve amplifying 1e-16 by up to 1e6
+SINGLE = 1e-5  # metrics are float32 also then
 SAME_SIZE = 0.01  # of the program's instruction counts
 
 
@@ -71,9 +73,26 @@ def assert_same_bits(one, two):
         np.testing.assert_array_equal(a, b)
 
 
-def assert_close(one, two, atol):
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
-        np.testing.assert_allclose(a, b, rtol=atol, atol=atol)
+# CPO's ten steps of conjugate gradient in float32 are not converged: a last bit
+# moves its policy by 1e-3. Across programs all else is compared, and in float64 it.
+BEFORE_THE_STEP = (
+    "j_c",
+    "ep_return",
+    "ep_cost",
+    "ep_total_cost",
+    "value_loss",
+    "cost_value_loss",
+    "policy_grad_norm",
+    "cost_grad_norm",
+    "violation",
+)
+
+
+def stable(result):
+    """What one update promises across programs in float32."""
+    (ppo, cpo), (ppo_metrics, cpo_metrics) = result
+    kept = {name: cpo_metrics[name] for name in BEFORE_THE_STEP}
+    return ppo, cpo.agent.critic, ppo_metrics, kept
 
 
 @pytest.fixture(scope="module")
@@ -164,8 +183,10 @@ def wide():
 
 
 def test_another_population_size(program, wide):
-    first = run(program, groups(), epochs=1)
-    assert_close(lanes(wide[1], slice(0, SIZE)), first, ONE_UPDATE)
+    first = stable(run(program, groups(), epochs=1))
+    again = stable(lanes(wide[1], slice(0, SIZE)))
+    for one, two in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
+        np.testing.assert_allclose(one, two, rtol=ONE_UPDATE, atol=ONE_UPDATE)
 
 
 def count_instructions(text):
@@ -199,6 +220,7 @@ from autocost_jax.population import make_agents, make_population
 
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 3)
+jax.config.update("jax_enable_x64", True)
 collectives = {{}}
 for count in (1, 2, 3):
     env = make_toy_env()
@@ -223,7 +245,8 @@ def devices(tmp_path_factory):
     """Three slots on 1, 2 (padded) and 3 devices: collectives found, and results.
 
     In a process of its own, because a CPU is split into devices once; and without
-    LLVM's optimisations, which see neither the partition nor a collective.
+    LLVM's optimisations, which see neither the partition nor a collective. In
+    float64, where rounding stays small also in CPO's step.
     """
     out = tmp_path_factory.mktemp("devices")
     script = SCRIPT.format(tests=str(Path(__file__).parent), out=str(out))
@@ -253,9 +276,17 @@ def test_any_number_of_devices_gives_the_same_numbers(devices, count):
     assert one.keys() == many.keys()
     for name, value in one.items():
         assert value.shape == many[name].shape
+        atol = DOUBLE if value.dtype == np.float64 else SINGLE
         np.testing.assert_allclose(
-            many[name], value, rtol=ONE_UPDATE, atol=ONE_UPDATE, err_msg=name
+            many[name], value, rtol=atol, atol=atol, err_msg=name
         )
+
+
+def test_the_devices_trained_in_float64(devices):
+    kinds = {name: value.dtype for name, value in devices[1][1].items()}
+    policies = [kind for name, kind in kinds.items() if "/agent/policy/" in name]
+    assert policies
+    assert set(policies) == {np.dtype(np.float64)}
 
 
 # The face of it -----------------------------------------------------------------
@@ -265,7 +296,7 @@ def test_segments_are_refused():
     env = make_toy_env()
     config = train_config(segments_per_episode=2)
     agents = make_agents(ALGORITHMS, config, env)
-    with pytest.raises(ValueError, match="segments_per_episode must be 1 .* got 2"):
+    with pytest.raises(ValueError, match=r"segments_per_episode must be 1 .*, got 2"):
         make_population(env, agents, config)
 
 

@@ -32,19 +32,24 @@ ALGORITHMS = {"ppo_lagrangian": ppo_lagrangian, "cpo": cpo}
 ACROSS_PROGRAMS = 1e-5  # one update of float32 sums in another order
 ROUNDING = 1e-5  # float32 sums of 64 rows against NumPy float64
 
+# Episodes of 16 steps: with the paper's 0.99 arriving late would cost nothing.
 LEARNING = train_config(
     agent=dataclasses.replace(
         AGENT,
+        gamma=0.9,
+        gae_lambda=0.9,
+        cost_gamma=0.9,
+        cost_gae_lambda=0.9,
         policy_lr=3e-3,
         target_kl=0.03,
         policy_passes=16,
         policy_minibatches=1,
         value_lr=1e-2,
-        value_passes=8,
+        value_passes=16,
         value_minibatches=1,
     ),
-    num_worlds=16,
-    num_epochs=40,
+    num_worlds=32,
+    num_epochs=50,
 )
 FREE, BOUND = 0, 1  # slots: no cost counts; its extrinsic cost does
 
@@ -67,7 +72,7 @@ def learnt(request, env):
 
 def test_training_raises_the_return(learnt):
     ep_return = learnt[3]["ep_return"][FREE]
-    assert ep_return[-5:].mean() > ep_return[:5].mean() + 0.3
+    assert ep_return[-5:].mean() > ep_return[:5].mean() + 0.5
 
 
 def test_a_constraint_lowers_the_cost(learnt):

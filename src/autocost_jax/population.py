@@ -176,7 +176,8 @@ def _chunk_fn(
             )
             return learners, metrics
 
-        return jax.lax.scan(body, learners, epoch + jnp.arange(config.chunk_epochs))
+        epochs = epoch + jnp.arange(config.chunk_epochs, dtype=jnp.int32)
+        return jax.lax.scan(body, learners, epochs)
 
     sharded = jax.shard_map(
         chunk,

@@ -1,0 +1,127 @@
+"""The other commands, in one tiny training run."""
+
+import json
+
+import numpy as np
+import pytest
+
+from autocost_jax.cli import main
+from autocost_jax.methods import Method, TableConfig, table_slots
+from autocost_jax.store import read_metrics
+
+TRAIN = ["train", "--preset", "smoke", "--episodes", "3"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """PPO and CPO, two seeds each, with a hand-made cost."""
+    out = tmp_path_factory.mktemp("runs") / "train"
+    flags = ["--algorithms", "ppo", "cpo", "--cost", "extrinsic+safety_margin_2x"]
+    main([*TRAIN, *flags, "--num-seeds", "2", "--limit", "0.5", "--out", str(out)])
+    return out
+
+
+def test_train_scores_every_method_and_seed(trained):
+    table = json.loads((trained / "evaluation.json").read_text())
+    rows = table["rows"]
+    assert [(row["method"], row["seed"]) for row in rows] == [
+        ("ppo", 0),
+        ("ppo", 1),
+        ("cpo", 0),
+        ("cpo", 1),
+    ]
+    assert all(row["episodes"] == 3 for row in rows)
+    epochs = read_metrics(trained)
+    assert [row["epoch"] for row in epochs] == [0, 1]
+    assert epochs[0]["ppo_lagrangian/multiplier"] == [0.0, 0.0]  # PPO ignores cost
+
+
+def test_train_resumes_and_ends_the_same(trained, capsys):
+    before = (trained / "evaluation.json").read_text()
+    flags = ["--algorithms", "ppo", "cpo", "--cost", "extrinsic+safety_margin_2x"]
+    flags += ["--num-seeds", "2", "--limit", "0.5", "--out", str(trained)]
+    main([*TRAIN, *flags, "--resume"])
+    assert "resuming" in capsys.readouterr().out
+    assert (trained / "evaluation.json").read_text() == before
+
+
+def test_evaluate_scores_saved_policies(trained, tmp_path, capsys):
+    out = tmp_path / "scores.json"
+    flags = ["--episodes", "4", "--deterministic", "--json", str(out)]
+    main(["evaluate", "--run", str(trained), "--policies", "cpo_seed1", *flags])
+    assert "cpo_seed1: return" in capsys.readouterr().out
+    (row,) = json.loads(out.read_text())
+    assert row["episodes"] == 4
+    assert np.isfinite(row["return_mean"])
+
+
+def test_info_lists_what_there_is(capsys, trained):
+    main(["info"])
+    text = capsys.readouterr().out
+    for word in ("Goal-Hazard-Point", "laptop", "safety_margin_3x", "jax"):
+        assert word in text
+    main(["info", "--run", str(trained)])
+    assert "extrinsic+safety_margin_2x" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["fly"], ["fly", "train", "evaluate", "report", "info"]),
+        ([*TRAIN, "--cost", "pain"], ["pain", "extrinsic", "safety_margin_2x"]),
+        ([*TRAIN, "--cost", "x*extrinsic"], ["'x'"]),
+        ([*TRAIN, "--cost", "intrinsic"], ["theta"]),
+        ([*TRAIN, "--theta", "no.npz"], ["no.npz"]),
+        ([*TRAIN, "--env", "Goal-Hazard-Cat"], ["Goal-Hazard-Point"]),
+        ([*TRAIN, "--algorithms", "dqn"], ["dqn", "cpo"]),
+        ([*TRAIN, "--num-seeds", "0"], ["seeds"]),
+        (["train", "--preset", "tiny"], ["tiny", "laptop"]),
+        (["evaluate", "--run", "nowhere"], ["nowhere"]),
+        (["report", "--run", "nowhere"], ["nowhere"]),
+        (["info", "--run", "nowhere"], ["nowhere"]),
+    ],
+)
+def test_bad_input_gets_one_line_and_status_2(argv, words, capsys, tmp_path):
+    if argv[0] == "train":
+        argv = [*argv, "--out", str(tmp_path / "run")]
+    with pytest.raises(SystemExit) as stop:
+        main(argv)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    for word in words:
+        assert word in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_unknown_policy_lists_those_of_the_run(trained, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", "--run", str(trained), "--policies", "best"])
+    assert stop.value.code == 2
+    assert "cpo_seed0" in capsys.readouterr().err
+
+
+def test_no_command_prints_the_commands(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([])
+    assert stop.value.code == 2
+    assert "evaluate" in capsys.readouterr().out
+
+
+def test_report_of_a_table_is_refused_in_one_line(trained, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["report", "--run", str(trained)])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_slots_of_a_table_follow_its_rows():
+    config = TableConfig(
+        methods=(Method("a", "ppo"), Method("b", "cpo", limit=-1.0)), seeds=(4, 5)
+    )
+    assert config.algorithms == ("ppo_lagrangian", "cpo")
+    ppo, cpo = table_slots(config)
+    np.testing.assert_array_equal(ppo.constrained, [0.0, 0.0])
+    np.testing.assert_array_equal(cpo.cost.limit, [-1.0, -1.0])
+    with pytest.raises(ValueError, match="distinct labels"):
+        TableConfig(methods=(Method("a"), Method("a")))

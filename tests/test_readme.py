@@ -1,0 +1,95 @@
+"""What the README says is so."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from autocost_jax import EnvConfig, preset
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def table_row(first_cell: str) -> str:
+    (row,) = re.findall(rf"^\| {re.escape(first_cell)} \|(.*)\|$", README, re.M)
+    return row.strip()
+
+
+def test_the_python_example_runs(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    assert len(code.strip().splitlines()) <= 13
+    # The same lines at a size that a test can afford.
+    code = code.replace('preset("laptop")', 'preset("smoke")')
+    code = code.replace('make_env("Goal-Hazard-Point")', "make_env(config.env)")
+    exec(compile(code, "README.md", "exec"), {})
+    first, second = capsys.readouterr().out.strip().splitlines()
+    assert len(first.split()) == 2
+    assert 0.0 <= float(second) <= 1.0
+
+
+@pytest.mark.parametrize("name", ["laptop (default)", "search", "paper", "smoke"])
+def test_the_preset_table_is_the_presets(name):
+    key = f"`{name.split()[0]}`" + (" (default)" if "default" in name else "")
+    row = table_row(key)
+    config = preset(name.split()[0])
+    agent = config.train.agent
+    words = [
+        f"{config.population_size} candidates",
+        f"{config.num_elites} elite",
+        "nets " + "-".join(map(str, agent.hidden_sizes)),
+        f"{config.train.num_worlds} worlds",
+        f"{config.train.num_epochs} epochs",
+        f"{config.num_stages} stages",
+    ]
+    if name != "smoke":
+        words.append(f"init_std {config.init_std:g}")
+        words.append(
+            "80 full-batch steps"
+            if agent.policy_minibatches == 1
+            else f"{agent.policy_passes} passes x {agent.policy_minibatches} minibatches"
+        )
+    for word in words:
+        assert word in row, word
+
+
+def test_the_table_of_the_world_is_the_default_world():
+    config = EnvConfig()
+    assert set(map(abs, config.placements_extents)) == {2.0}
+    assert table_row("extents") == "2 m"
+    assert table_row("hazards") == (
+        f"{config.hazards_num}, radius {config.hazards_size} m, "
+        f"keepout {config.hazards_keepout} m"
+    )
+    assert table_row("goal") == (
+        f"radius {config.goal_size} m, keepout {config.goal_keepout} m"
+    )
+    assert table_row("robot keepout") == f"{config.robot_keepout} m"
+    assert config.lidar_max_dist is None  # exponential
+    assert table_row("lidars") == (
+        f"{config.lidar_num_bins} bins, exponential, gain {config.lidar_exp_gain:g}"
+    )
+    assert f"{config.num_steps} steps of 0.02 s" in table_row("episode")
+    assert not config.constrain_indicator
+
+
+def test_ci_runs_the_test_command_of_the_readme():
+    (command,) = re.findall(r"^pip install -e '\.\[dev\]' && pytest$", README, re.M)
+    script = (ROOT / ".ci" / "run").read_text()
+    assert command.replace("pip install", "pip install -q") in script
+
+
+def test_files_that_the_readme_shows_exist():
+    for link in re.findall(r"\]\((?!https?:)([^)]+)\)", README):
+        assert (ROOT / link).exists(), link
+
+
+def test_the_wheel_would_hold_everything_that_is_read_at_run_time():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"] == [
+        "src/autocost_jax"
+    ]
+    package = ROOT / "src" / "autocost_jax"
+    for name in ("py.typed", "envs/xmls/point.xml", "report_assets/page.html"):
+        assert (package / name).exists()
