@@ -117,7 +117,7 @@ def test_every_field_has_a_bad_value_above(kind):
 
 @pytest.mark.parametrize("name", ["policy_minibatches", "value_minibatches"])
 def test_minibatches_must_divide_the_rows_of_an_epoch(name):
-    agent = AgentConfig(**{name: 7})
+    agent = dataclasses.replace(AgentConfig(), **{name: 7})
     with pytest.raises(ValueError, match=f"{name} must be a divisor of .* 30000"):
         TrainConfig(agent=agent)
     assert TrainConfig(agent=agent, num_worlds=7).agent is agent

@@ -113,9 +113,8 @@ def test_the_order_of_candidates_is_irrelevant(key):
     fitness = Fitness(cost=cost, ep_return=jax.random.normal(keys[2], (size,)))
     order = jax.random.permutation(keys[3], size)
     elites, index = select(candidates, fitness, 8)
-    shuffled, shuffled_index = select(
-        *jax.tree.map(lambda x: x[order], (candidates, fitness)), 8
-    )
+    shuffle = jax.tree.map(lambda x: x[order], (candidates, fitness))
+    shuffled, shuffled_index = select(shuffle[0], shuffle[1], 8)
     np.testing.assert_array_equal(elites["theta"], shuffled["theta"])
     np.testing.assert_array_equal(index, order[shuffled_index])
 

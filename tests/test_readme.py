@@ -48,7 +48,7 @@ def test_the_preset_table_is_the_presets(name):
         words.append(
             "80 full-batch steps"
             if agent.policy_minibatches == 1
-            else f"{agent.policy_passes} passes x {agent.policy_minibatches} minibatches"
+            else f"{agent.policy_passes} passes x {agent.policy_minibatches} mini"
         )
     for word in words:
         assert word in row, word

@@ -7,6 +7,7 @@ drives into it, a constrained learner stops at its rim.
 import dataclasses
 from collections.abc import Callable
 from types import MappingProxyType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,14 @@ from autocost_jax.agents.base import Agent, EnvSizes
 from autocost_jax.config import AgentConfig, EnvConfig, SearchConfig, TrainConfig
 from autocost_jax.costs import training_cost
 from autocost_jax.envs.env import Env
-from autocost_jax.records import CostInputs, EnvState, Layout, Slot, TrainingCost
+from autocost_jax.records import (
+    CostInputs,
+    EnvState,
+    Layout,
+    Metrics,
+    Slot,
+    TrainingCost,
+)
 
 NUM_STEPS = 16
 SPEED = 0.15  # metres a step at full throttle
@@ -185,7 +193,7 @@ def linear_agent(env: EnvSizes, lr: float = 1.0, broken_epoch: int = -1) -> Agen
     loses its mind if `constrained` is above 1.
     """
 
-    def init(key: jax.Array) -> LinearState:
+    def init(key: jax.Array) -> Any:
         shape = (env.observation_size, env.action_size)
         weights = 0.1 * jax.random.normal(key, shape)
         return LinearState(weights, jnp.zeros((), jnp.int32))
@@ -195,7 +203,7 @@ def linear_agent(env: EnvSizes, lr: float = 1.0, broken_epoch: int = -1) -> Agen
         noise = jax.random.normal(key, mean.shape)
         return mean if deterministic else mean + 0.5 * noise
 
-    def update(state, trajectory, total_cost, slot, key):
+    def update(state, trajectory, total_cost, slot, key) -> tuple[Any, Metrics]:
         del key
         obs, valid = trajectory.obs[:-1], trajectory.valid
         score = trajectory.reward - 4.0 * slot.constrained * total_cost

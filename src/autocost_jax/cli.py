@@ -162,7 +162,7 @@ def _evaluate(argv: list[str]) -> None:
             f"policies: {', '.join(known) or 'none'}"
         )
     files = [options.run / "policies" / f"{name}.npz" for name in names]
-    agent, states = load_policies(config, files)
+    agent, states = load_policies(config.train, files)
     env = make_env(config.train.env)
     run = make_evaluator(env, agent, options.episodes, options.deterministic)
     results, _ = run(states, jax.random.key(options.seed))

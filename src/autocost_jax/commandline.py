@@ -14,7 +14,7 @@ BAD_INPUT = 2
 
 
 def parse(kind: type[T], argv: Sequence[str], prog: str, **options: Any) -> T:
-    """Flags of a dataclass by tyro; a bad one ends the program in one line, status 2."""
+    """Flags of a dataclass; a bad one ends the program in one line, status 2."""
     import tyro
 
     panel = io.StringIO()
@@ -34,7 +34,8 @@ def _first_sentence(panel: str) -> str:
     text = " ".join(line for line in lines if line)
     text = re.sub(r"^(Parsing error|Value error|Error parsing \S+:)\s+", "", text)
     text = re.sub(r"^Error parsing (search|train):\s+", "", text)
-    return re.split(r"\s+(?:Argument helptext|For full helptext|Arguments similar)", text)[0]
+    advice = r"\s+(?:Argument helptext|For full helptext|Arguments similar)"
+    return re.split(advice, text)[0]
 
 
 def fail(message: str, status: int = BAD_INPUT) -> None:

@@ -69,7 +69,13 @@ class Best(struct.PyTreeNode):
 
 
 class ES(NamedTuple):
-    """init() -> state; ask(key, state) -> candidates; tell(key, state, ...) -> state."""
+    """A strategy as pure functions.
+
+    Attributes:
+      init: () -> state.
+      ask: (key, state) -> candidates, stacked [P, ...]; the key is consumed.
+      tell: (key, state, candidates, fitness) -> state; the key is consumed.
+    """
 
     init: Callable[[], ESState]
     ask: Callable[[Key, ESState], Any]
@@ -212,9 +218,9 @@ def truncation_es(config: SearchConfig) -> ES:
 
 
 def best(state: ESState, population_size: int, zero_tolerance: float = 0.0) -> Best:
-    """The final pick: of all zero-violation candidates of the search the highest return.
+    """The final pick: of all zero-violation candidates the one of highest return.
 
-    Without any, the candidate of lowest cost; `zero_violation` says which it is.
+    Without any, that of lowest cost; `zero_violation` says which it is.
     """
     fitness = state.archive_fitness
     index = rank(fitness, zero_tolerance)[0]

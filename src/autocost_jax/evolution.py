@@ -271,7 +271,7 @@ def search(
 
 def make_searcher(
     config: SearchConfig,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
     bank: Sequence[CostTerm] = BANK,
 ) -> Searcher:
     """Build the program of a search; nothing is compiled yet."""
@@ -339,9 +339,7 @@ def _begin_stage(searcher: Searcher, es_state: ESState, stage: int) -> SearchSta
     )
 
 
-def _run_chunk(
-    searcher: Searcher, state: SearchState
-) -> tuple[SearchState, Progress]:
+def _run_chunk(searcher: Searcher, state: SearchState) -> tuple[SearchState, Progress]:
     """One chunk; at a stage's end also `tell` and the beginning of the next stage."""
     config, functions = searcher.config, searcher.stage
     stage, epoch = int(state.stage), int(state.epoch)
@@ -356,9 +354,7 @@ def _run_chunk(
     if after < config.train.num_epochs:
         return state, progress
     frozen = jnp.stack([group.frozen for group in learners])
-    es_state, result = functions.end(
-        state.es, stage, state.candidates, history, frozen
-    )
+    es_state, result = functions.end(state.es, stage, state.candidates, history, frozen)
     progress = progress._replace(result=result, learners=learners)
     if stage + 1 < config.num_stages:
         return _begin_stage(searcher, es_state, stage + 1), progress

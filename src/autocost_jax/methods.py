@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 
 from autocost_jax.arrays import flatten
-from autocost_jax.config import TrainConfig
+from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import training_cost
 from autocost_jax.envs.env import make_env
 from autocost_jax.population import (
@@ -35,7 +35,8 @@ from autocost_jax.store import RunDir, check_free_space, estimate_bytes
 from autocost_jax.train import Learner
 
 Learners = Literal["ppo", "ppo_lagrangian", "cpo"]
-GROUPS = ("ppo_lagrangian", "cpo")  # PPO is a PPO-Lagrangian slot that ignores cost
+# PPO is a PPO-Lagrangian slot that ignores cost.
+GROUPS: tuple[Algorithm, ...] = ("ppo_lagrangian", "cpo")
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class TableConfig:
         ]
 
     @property
-    def algorithms(self) -> tuple[str, ...]:
+    def algorithms(self) -> tuple[Algorithm, ...]:
         """The groups that have slots."""
         return tuple(name for name in GROUPS if self.group(name))
 
@@ -143,7 +144,7 @@ def run_table(
     *,
     resume: bool = False,
     overwrite: bool = False,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
     num_episodes: int = 100,
 ) -> list[dict[str, Any]]:
     """Train and evaluate a table in a run directory, or resume it.
@@ -256,7 +257,7 @@ def _finish(
             files.append(run.write_policy(stem, flatten(params)))
             table.append({"method": method.label, "seed": seed})
     display.say(f"evaluating {len(files)} policies over {num_episodes} episodes ...")
-    agent, states = load_policies(config, files)
+    agent, states = load_policies(config.train, files)
     env = make_env(config.train.env)
     key = jax.random.key(EVALUATION)
     results, _ = make_evaluator(env, agent, num_episodes)(states, key)

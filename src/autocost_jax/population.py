@@ -83,7 +83,7 @@ def make_population(
     agents: Sequence[Agent],
     config: TrainConfig,
     bank: Sequence[CostTerm] = BANK,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> Population:
     """The program that trains groups of slots, one group for each agent.
 
@@ -190,9 +190,7 @@ def _chunk_fn(
 
 
 def _sharded(fn: Callable, mesh: Mesh, spec: P) -> Callable:
-    return jax.shard_map(
-        fn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
-    )
+    return jax.shard_map(fn, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
 
 
 def _sizes(groups: tuple[Slot, ...]) -> list[int]:

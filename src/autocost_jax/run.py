@@ -1,6 +1,7 @@
 """One search in a run directory: watched, checkpointed, resumed, reported."""
 
 import dataclasses
+import itertools
 import sys
 import time
 from collections.abc import Sequence
@@ -11,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from autocost_jax.agents.base import Agent
 from autocost_jax.arrays import flatten, load_arrays, unflatten
-from autocost_jax.config import SearchConfig
+from autocost_jax.config import SearchConfig, TrainConfig
 from autocost_jax.envs.env import make_env
 from autocost_jax.evolution import (
     Progress,
@@ -42,7 +44,7 @@ def estimate_memory(config: SearchConfig, num_devices: int) -> int:
     row = env.observation_size + 2 * env.action_size + 24
     rows = config.train.num_worlds * env.episode_length
     sizes = (env.observation_size, *config.train.agent.hidden_sizes, env.action_size)
-    weights = sum(a * b for a, b in zip(sizes[:-1], sizes[1:], strict=True))
+    weights = sum(a * b for a, b in itertools.pairwise(sizes))
     width = max(config.train.agent.hidden_sizes)
     batch = rows // config.train.agent.value_minibatches
     activations = 4 * batch * width * len(config.train.agent.hidden_sizes)
@@ -68,7 +70,7 @@ def describe(config: SearchConfig, num_devices: int) -> list[str]:
     ]
 
 
-def check_memory(config: SearchConfig, devices: Sequence[jax.Device]) -> None:
+def check_memory(config: SearchConfig, devices: Sequence[Any]) -> None:
     """Refuse a run whose arrays cannot fit on its devices.
 
     Raises:
@@ -91,7 +93,7 @@ def run_search(
     *,
     resume: bool = False,
     overwrite: bool = False,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
     num_episodes: int = 100,
 ) -> Path:
     """Run or resume a search and leave everything about it in a run directory.
@@ -176,7 +178,8 @@ def _train(
     chunk = config.train.chunk_epochs
     chunk_steps = config.env_steps // (config.num_stages * config.train.num_epochs)
     display.start_clock()
-    for state, progress in evolve(config, state=state, searcher=searcher):
+    for after, progress in evolve(config, state=state, searcher=searcher):
+        state = after
         first = progress.stage * config.train.num_epochs + progress.epoch
         display.update(
             summarise(
@@ -234,11 +237,11 @@ def policy_name(stage: int, algorithm: str) -> str:
     return f"stage_{stage:02d}_{algorithm}"
 
 
-def load_policies(config: SearchConfig, files: Sequence[Path]) -> tuple[Any, Any]:
+def load_policies(train: TrainConfig, files: Sequence[Path]) -> tuple[Agent, Any]:
     """Saved policies as one stacked agent state, and the agent that acts for it.
 
     Args:
-      config: the run's configuration, for the shapes.
+      train: the run's training configuration, for the shapes.
       files: policies/*.npz.
 
     Returns:
@@ -247,8 +250,8 @@ def load_policies(config: SearchConfig, files: Sequence[Path]) -> tuple[Any, Any
     Raises:
       RunDirError: a file is missing or is not such a policy.
     """
-    env = make_env(config.train.env)
-    (agent,) = make_agents(config.algorithms[:1], config.train, env)
+    # Whose policy it is does not matter: all agents act alike.
+    (agent,) = make_agents(("ppo_lagrangian",), train, make_env(train.env))
     template = agent.init(jax.random.key(0))
     loaded = [unflatten(load_arrays(file, None), template.policy) for file in files]
     stacked = jax.tree.map(
@@ -277,7 +280,7 @@ def _finish(
         run.path / "policies" / f"{policy_name(stage, name)}.npz"
         for name in config.algorithms
     ]
-    agent, states = load_policies(config, files)
+    agent, states = load_policies(config.train, files)
     env = make_env(config.train.env)
     key = jax.random.fold_in(searcher.root, EVALUATION)
     results, episodes = make_evaluator(env, agent, num_episodes)(states, key)

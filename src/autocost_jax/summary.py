@@ -134,7 +134,7 @@ def _replay(path: Path, config: SearchConfig) -> Replay | None:
     file, cost = path / "replay.npz", path / "cost.npz"
     if not (file.exists() and cost.exists()):
         return None
-    arrays = load_arrays(file, None)
+    arrays: dict[str, Any] = dict(load_arrays(file, None))
     env = make_env(config.train.env)
     theta = load_arrays(cost, None)["theta"]
     return Replay(
@@ -157,7 +157,7 @@ def _config_lines(
         "environment": train.env.name,
         "algorithms": ", ".join(config.algorithms),
         "cost limit": f"{config.cost_limit:g}",
-        "population": f"{config.population_size} candidates, {config.num_elites} elites",
+        "population": f"{config.population_size}, {config.num_elites} elites",
         "stages": str(config.num_stages),
         "selection": config.selection,
         "initial std of theta": f"{config.init_std:g}",

@@ -131,7 +131,7 @@ def init_worlds(
         lambda key: reset_worlds(env, jax.random.fold_in(key, INIT), num_carried)
     )(keys)
 
-    def warm_up(carried: EnvState, segment: jax.Array):
+    def warm_up(carried: EnvState | None, segment: jax.Array):
         # Negative epochs: their keys are not those of any training epoch.
         worlds, _, _ = _rollout(
             env, agents, config, learners, slots, carried, -1 - segment
@@ -220,9 +220,7 @@ def _rollout(
     """
 
     def keys(purpose: int) -> list[Key]:
-        return [
-            jax.vmap(lambda slot: slot_key(slot, epoch, purpose))(s) for s in slots
-        ]
+        return [jax.vmap(lambda slot: slot_key(slot, epoch, purpose))(s) for s in slots]
 
     fresh = jax.vmap(lambda key: reset_worlds(env, key, config.num_worlds))(
         jnp.concatenate(keys(RESET))

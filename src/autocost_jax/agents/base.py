@@ -77,9 +77,9 @@ class Agent(NamedTuple):
         the key is consumed, the state keeps its type, metrics are float32 scalars.
     """
 
-    init: Callable[[Key], AgentState]
+    init: Callable[[Key], Any]
     policy: Callable[..., jax.Array]
-    update: Callable[..., tuple[AgentState, Metrics]]
+    update: Callable[..., tuple[Any, Metrics]]
 
 
 class Batch(struct.PyTreeNode):

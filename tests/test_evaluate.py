@@ -1,0 +1,106 @@
+"""Whole episodes of a fixed policy against a loop of single steps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from autocost_jax.evaluate import evaluate, run_episodes, score
+from toys import NUM_STEPS, LinearState, linear_agent, make_toy_env
+
+NUM_EPISODES = 6
+ROUNDING = 1e-5  # 16 float32 terms summed in another order
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_toy_env()
+
+
+@pytest.fixture(scope="module")
+def state(env):
+    """A policy that heads for the goal."""
+    weights = jnp.zeros((env.observation_size, 2)).at[2:4].set(jnp.eye(2))
+    return LinearState(weights, jnp.zeros((), jnp.int32))
+
+
+def by_hand(env, state, key, deterministic):
+    """Return, cost and path of each episode, one world and one step at a time."""
+    agent = linear_agent(env)
+    key_reset, key_act = jax.random.split(key)
+    worlds = jax.vmap(env.reset)(jax.random.split(key_reset, NUM_EPISODES))
+    step = jax.jit(env.step)
+    act = jax.jit(lambda obs, key: agent.policy(state, obs, key, deterministic))
+    episodes = [jax.tree.map(lambda x, i=i: x[i], worlds) for i in range(NUM_EPISODES)]
+    sums = np.zeros((3, NUM_EPISODES))
+    for t in range(NUM_STEPS):
+        obs = jnp.stack([world.obs for world in episodes])
+        action = act(obs, jax.random.fold_in(key_act, t))
+        for i in range(NUM_EPISODES):
+            before = np.asarray(episodes[i].layout.robot_xy)
+            episodes[i] = step(episodes[i], action[i])
+            path = np.linalg.norm(np.asarray(episodes[i].layout.robot_xy) - before)
+            sums[:, i] += episodes[i].reward, episodes[i].cost, path
+    return sums
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_sums_against_a_loop(env, state, key, deterministic):
+    agent = linear_agent(env)
+    result = jax.jit(
+        lambda s, k: evaluate(env, agent, s, k, NUM_EPISODES, deterministic)
+    )(state, key)
+    ep_return, ep_cost, path = by_hand(env, state, key, deterministic)
+    np.testing.assert_allclose(result.ep_return, ep_return, atol=ROUNDING)
+    np.testing.assert_allclose(result.ep_cost, ep_cost, atol=ROUNDING)
+    np.testing.assert_allclose(result.distance_travelled, path, atol=ROUNDING)
+    assert result.valid.tolist() == [1.0] * NUM_EPISODES
+    assert len(np.unique(result.ep_return)) == NUM_EPISODES
+    assert float(result.violation_rate) == pytest.approx((ep_cost > 0).mean())
+
+
+def test_the_mean_acts_without_a_key(env, state, key):
+    """Deterministic: the layouts alone decide. Sampled: the actions vary as well."""
+    agent = linear_agent(env)
+    starts, actions = {}, {}
+    for deterministic in (False, True):
+        episodes = run_episodes(env, agent, state, key, 2, deterministic)
+        starts[deterministic] = np.asarray(episodes.start.robot_xy)
+        positions = np.concatenate(
+            [starts[deterministic][None], np.asarray(episodes.robot_xy)]
+        )
+        goal = np.asarray(episodes.goal_xy)
+        moves = np.diff(positions, axis=0)
+        expected = 0.15 * np.clip(goal - positions[:-1], -1.0, 1.0)
+        actions[deterministic] = np.abs(moves - expected).max()
+    np.testing.assert_array_equal(starts[False], starts[True])
+    assert actions[True] < ROUNDING
+    assert actions[False] > 0.01
+
+
+def test_failed_episodes_count_for_nothing(state, key):
+    """Worlds that start on the left break half-way; their costs do not violate."""
+    env = make_toy_env(
+        fails=lambda layout, age: (layout.goal_xy[0] < 0) & (age > NUM_STEPS // 2)
+    )
+    agent = linear_agent(env)
+    episodes = jax.jit(lambda s, k: run_episodes(env, agent, s, k, 40))(state, key)
+    result = score(episodes)
+    broken = np.asarray(episodes.start.goal_xy)[:, 0] < 0
+    assert 0 < broken.sum() < 40
+    np.testing.assert_array_equal(result.valid, 1.0 - broken)
+    assert (np.asarray(episodes.valid).sum(axis=0)[broken] == NUM_STEPS // 2).all()
+    violates = np.asarray(result.ep_cost) > 0
+    assert violates[broken].any()
+    expected = violates[~broken].mean()
+    assert float(result.violation_rate) == pytest.approx(expected)
+    assert expected != pytest.approx(violates.mean())
+
+
+def test_no_valid_episode_has_no_violation(state, key):
+    env = make_toy_env(fails=lambda layout, age: age > 0)
+    agent = linear_agent(env)
+    result = evaluate(env, agent, state, key, 2)
+    assert result.valid.tolist() == [0.0, 0.0]
+    assert float(result.violation_rate) == 0.0
+    assert np.isfinite(result.ep_return).all()

@@ -1,0 +1,329 @@
+"""The search on the toy environment: watched, resumed or pure, it is one search."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from autocost_jax import evolution, population
+from autocost_jax.costs import BANK, CostTerm
+from autocost_jax.es import truncation_es
+from autocost_jax.evolution import (
+    ASK,
+    best_of,
+    evolve,
+    init_search,
+    make_searcher,
+    search,
+    stage_key,
+    stage_result,
+    stage_slots,
+)
+from toys import (
+    Counter,
+    linear_agent,
+    make_toy_env,
+    search_config,
+    train_config,
+)
+
+CONFIG = search_config(
+    train=train_config(num_epochs=6), num_stages=3, fitness_epochs=2, init_std=5.0
+)
+ACROSS_PROGRAMS = 1e-4  # six epochs of float32 in two programs; the toy is smooth
+
+
+@pytest.fixture(scope="module", autouse=True)
+def toy_world():
+    """The search finds the toy environment and a cheap agent in place of its own."""
+    counter = Counter()
+
+    def make_agents(algorithms, config, env):
+        del config
+        return tuple(linear_agent(env) for _ in algorithms)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            evolution, "make_env", lambda c: make_toy_env(c.num_steps, counter=counter)
+        )
+        patch.setattr(evolution, "make_agents", make_agents)
+        yield counter
+
+
+@pytest.fixture(scope="module")
+def searcher():
+    return make_searcher(CONFIG)
+
+
+def copy(tree):
+    """NumPy copies: what a checkpoint holds, safe from donation."""
+    return jax.tree.map(np.array, tree)
+
+
+def run(config=CONFIG, **options):
+    """All yielded states and reports of a search, copied."""
+    return [(copy(state), report) for state, report in evolve(config, **options)]
+
+
+@pytest.fixture(scope="module")
+def events(searcher):
+    return run(searcher=searcher)
+
+
+def results(events):
+    return [report.result for _, report in events if report.result is not None]
+
+
+def assert_same_bits(one, two):
+    assert jax.tree.structure(one) == jax.tree.structure(two)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_every_chunk_is_reported(events):
+    assert [(e.stage, e.epoch) for _, e in events] == [
+        (stage, epoch) for stage in range(3) for epoch in range(6)
+    ]
+    ends = [report.result is not None for _, report in events]
+    assert ends == ([False] * 5 + [True]) * 3
+    for _, report in events:
+        for group in report.metrics:
+            assert group["ep_cost"].shape == (1, CONFIG.population_size)
+            assert isinstance(group["ep_cost"], np.ndarray)
+
+
+def test_the_state_counts(events):
+    places = [(int(state.stage), int(state.epoch)) for state, _ in events]
+    assert places[:7] == [(0, 1), (0, 2), (0, 3), (0, 4), (0, 5), (1, 0), (1, 1)]
+    assert places[-1][0] == CONFIG.num_stages
+    assert int(events[-1][0].es.generation) == CONFIG.num_stages
+
+
+def test_fitness_is_the_mean_of_the_last_epochs(events):
+    """Of both algorithms, over `fitness_epochs`, from the reported metrics."""
+    for stage, result in enumerate(results(events)):
+        rows = [e.metrics for _, e in events if e.stage == stage]
+        for name, got in (
+            ("ep_cost", result.fitness.cost),
+            ("ep_return", result.fitness.ep_return),
+        ):
+            values = np.array([[g[name][0] for g in row] for row in rows])  # [E, A, P]
+            expected = values[-CONFIG.fitness_epochs :].mean(axis=(0, 1))
+            np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(
+                result.scores[name], values[-2:].mean(axis=0), rtol=1e-6, atol=1e-6
+            )
+        assert len(np.unique(result.fitness.ep_return)) == CONFIG.population_size
+
+
+def test_elites_are_retrained_with_new_seeds(events):
+    first, second = results(events)[:2]
+    order = np.asarray(first.order)
+    np.testing.assert_array_equal(second.candidates[:2], first.candidates[order[:2]])
+    assert not np.isin(second.fitness.ep_return, first.fitness.ep_return).any()
+
+
+def test_a_stage_asks_with_its_own_key(events):
+    strategy = truncation_es(CONFIG)
+    asked = strategy.ask(stage_key(jax.random.key(0), 0, ASK), strategy.init())
+    first = results(events)[0].candidates
+    np.testing.assert_allclose(first, asked, rtol=1e-6)  # compiled with its stage
+
+
+def test_the_archive_holds_every_stage(events):
+    es = events[-1][0].es
+    told = results(events)
+    np.testing.assert_array_equal(
+        es.archive, np.concatenate([result.candidates for result in told])
+    )
+    np.testing.assert_array_equal(
+        es.archive_fitness.cost, np.concatenate([r.fitness.cost for r in told])
+    )
+    pick = best_of(CONFIG, es)
+    chosen = told[int(pick.generation)]
+    np.testing.assert_array_equal(pick.candidate, chosen.candidates[int(pick.index)])
+
+
+# One and the same search --------------------------------------------------------
+
+
+def test_the_pure_search_is_the_same(events):
+    result = jax.jit(search(CONFIG))(jax.random.key(CONFIG.seed))
+    assert result.fitness.cost.shape == (3, CONFIG.population_size)
+    for stage, told in enumerate(results(events)):
+        np.testing.assert_allclose(
+            result.fitness.cost[stage], told.fitness.cost, atol=ACROSS_PROGRAMS
+        )
+        np.testing.assert_allclose(
+            result.fitness.ep_return[stage],
+            told.fitness.ep_return,
+            atol=ACROSS_PROGRAMS,
+        )
+    es = events[-1][0].es
+    np.testing.assert_allclose(result.es.archive, es.archive, rtol=1e-6)
+
+
+def test_the_same_seed_twice(searcher, events):
+    assert_same_bits(run(searcher=searcher)[-1][0], events[-1][0])
+
+
+def test_another_seed_is_another_search(events):
+    other = run(dataclasses.replace(CONFIG, seed=1, num_stages=1))
+    assert not np.isin(other[-1][0].candidates, events[5][0].candidates).any()
+
+
+@pytest.mark.parametrize("chunk", [0, 3, 5, 6, 11, 16])
+def test_resume_from_any_yielded_state(searcher, events, chunk):
+    """Within a stage, at its end, and before the last chunk; bit for bit."""
+    saved = copy(events[chunk][0])
+    resumed = run(searcher=searcher, state=saved)
+    assert len(resumed) == len(events) - chunk - 1
+    assert_same_bits(resumed[-1][0], events[-1][0])
+    for (_, one), (_, two) in zip(resumed, events[chunk + 1 :], strict=True):
+        assert (one.stage, one.epoch) == (two.stage, two.epoch)
+        assert_same_bits(one.metrics, two.metrics)
+
+
+def test_resume_in_a_new_process_compiles_the_same(events):
+    """A fresh searcher from the same configuration continues the same run."""
+    resumed = run(state=copy(events[13][0]), searcher=make_searcher(CONFIG))
+    assert_same_bits(resumed[-1][0], events[-1][0])
+
+
+def test_a_finished_search_has_nothing_to_do(searcher, events):
+    assert run(searcher=searcher, state=copy(events[-1][0])) == []
+
+
+@pytest.mark.parametrize("chunk_epochs", [2, 3])
+def test_chunks_of_another_length(events, chunk_epochs):
+    train = train_config(num_epochs=6, chunk_epochs=chunk_epochs)
+    other = run(dataclasses.replace(CONFIG, train=train))
+    assert len(other) == len(events) // chunk_epochs
+    assert other[0][1].metrics[0]["ep_cost"].shape == (chunk_epochs, 4)
+    for one, two in zip(results(other), results(events), strict=True):
+        np.testing.assert_allclose(
+            one.fitness.cost, two.fitness.cost, atol=ACROSS_PROGRAMS
+        )
+        np.testing.assert_allclose(
+            one.fitness.ep_return, two.fitness.ep_return, atol=ACROSS_PROGRAMS
+        )
+
+
+# One trace, one compile ---------------------------------------------------------
+
+
+def test_one_trace_and_one_compilation(toy_world, monkeypatch, caplog):
+    """Of the chunk; and after two stages nothing at all is compiled any more.
+
+    The small functions around it are compiled twice: for a state that has just been
+    made, and for one that has been on the devices.
+    """
+    traces, chunks, compiled = [], [], []
+    run_epoch = population.run_epoch
+
+    def counted(*args):
+        traces.append(1)
+        return run_epoch(*args)
+
+    monkeypatch.setattr(population, "run_epoch", counted)
+    toy_world.steps = 0
+    config = dataclasses.replace(CONFIG, num_stages=4, seed=5)
+    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
+        for _, report in evolve(config):
+            if report.result is not None:
+                lines = [record.getMessage() for record in caplog.records]
+                lines = [line for line in lines if line.startswith("Compiling ")]
+                compiled.append(len(lines))
+                chunks.append(sum("jit(chunk)" in line for line in lines))
+    assert len(traces) == 1
+    assert toy_world.steps == 1
+    assert chunks == [1, 1, 1, 1]
+    assert compiled[1:] == [compiled[1]] * 3
+
+
+# Broken candidates --------------------------------------------------------------
+
+
+def make_history(cost, ep_return):
+    """[E, A, P] histories of every tracked metric."""
+    cost, ep_return = jnp.asarray(cost), jnp.asarray(ep_return)
+    others = {name: jnp.zeros_like(cost) for name in evolution.TRACKED}
+    return others | {"ep_cost": cost, "ep_return": ep_return}
+
+
+def test_a_frozen_agent_costs_everything():
+    """Whatever its metrics say; one broken algorithm is enough."""
+    cost = jnp.zeros((6, 2, 4)).at[:, :, 3].set(2.0)
+    frozen = jnp.zeros((2, 4), bool).at[1, 0].set(True)
+    result = stage_result(
+        CONFIG, jnp.zeros((4, 41)), make_history(cost, cost + 1.0), frozen
+    )
+    assert result.fitness.cost.tolist() == [np.inf, 0.0, 0.0, 2.0]
+    assert result.fitness.ep_return.tolist() == [-np.inf, 1.0, 1.0, 3.0]
+    assert result.order.tolist() == [1, 2, 3, 0]
+
+
+def poison(searcher, broken):
+    """A state before the first chunk, with NaN parameters in some slots."""
+    state = init_search(searcher)
+    group = state.learners[0]
+    weights = group.agent.weights.at[np.array(broken)].set(jnp.nan)
+    group = group.replace(agent=group.agent.replace(weights=weights))
+    return state.replace(learners=(group, *state.learners[1:]))
+
+
+def test_a_frozen_candidate_is_never_an_elite(searcher):
+    stage = run(searcher=searcher, state=poison(searcher, [0, 2]))[:6]
+    result = stage[-1][1].result
+    assert result is not None
+    assert result.frozen.tolist() == [[True, False, True, False], [False] * 4]
+    assert np.isinf(result.fitness.cost).tolist() == [True, False, True, False]
+    elites = stage[-1][0].es.elites
+    assert sorted(np.asarray(result.order[:2]).tolist()) == [1, 3]
+    assert not np.isin(elites, result.candidates[np.array([0, 2])]).any()
+
+
+def test_a_stage_without_survivors_ends_the_search(searcher):
+    state = poison(searcher, range(CONFIG.population_size))
+    seen = []
+    with pytest.raises(RuntimeError, match="every candidate of stage 0 failed"):
+        seen.extend(evolve(CONFIG, searcher=searcher, state=state))
+
+
+def test_random_selection_is_another_search(events):
+    config = dataclasses.replace(CONFIG, selection="random", num_stages=2)
+    other = results(run(config))
+    same = results(events)
+    assert_same_bits(other[0].candidates, same[0].candidates)
+    np.testing.assert_array_equal(other[0].order, same[0].order)
+    assert not np.array_equal(other[1].candidates[:2], same[1].candidates[:2])
+
+
+# Slots --------------------------------------------------------------------------
+
+
+def test_slots_of_a_stage(key):
+    candidates = jax.random.normal(key, (4, 41))
+    config = dataclasses.replace(CONFIG, cost_limit=-0.5)
+    groups = stage_slots(config, key, 1, candidates)
+    assert len(groups) == 2
+    keys = [jax.random.key_data(group.key) for group in groups]
+    for group, data in zip(groups, keys, strict=True):
+        np.testing.assert_array_equal(group.cost.theta, candidates)
+        assert (group.cost.limit == -0.5).all()
+        named = dict(zip([t.name for t in BANK], group.cost.weights.T, strict=True))
+        used = {name for name, weight in named.items() if (weight != 0).all()}
+        assert used == {"extrinsic", "intrinsic"}
+        assert len(np.unique(data, axis=0)) == 1  # common random numbers
+    assert not np.array_equal(keys[0], keys[1])
+    later = stage_slots(config, key, 2, candidates)
+    assert not np.array_equal(jax.random.key_data(later[0].key), keys[0])
+
+
+def test_a_longer_bank_of_a_user():
+    bank = (*BANK, CostTerm("extra", lambda inputs, theta: inputs.cost))
+    config = search_config(num_stages=1)
+    events = run(config, searcher=make_searcher(config, bank=bank))
+    assert np.isfinite(results(events)[0].fitness.cost).all()
