@@ -149,8 +149,8 @@ def _evaluate(argv: list[str]) -> None:
 
     from autocost_jax.arrays import RunDirError
     from autocost_jax.envs.env import make_env
+    from autocost_jax.policies import eval_summary, load_policies, score_line
     from autocost_jax.population import make_evaluator
-    from autocost_jax.run import eval_summary, load_policies
 
     config = _run_config(options.run)
     known = sorted(file.stem for file in (options.run / "policies").glob("*.npz"))
@@ -170,11 +170,7 @@ def _evaluate(argv: list[str]) -> None:
     for i, name in enumerate(names):
         row = eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
         rows.append({"policy": name, **row})
-        print(
-            f"{name}: return {row['return_mean']:.2f} +- {row['return_ci']:.2f}, "
-            f"extrinsic cost {row['cost_mean']:.3f} +- {row['cost_ci']:.3f}, "
-            f"violating episodes {row['violation_rate']:.1%} of {row['episodes']}"
-        )
+        print(score_line(name, row))
     if options.json is not None:
         options.json.write_text(json.dumps(rows, indent=2) + "\n")
 

@@ -21,6 +21,12 @@ from autocost_jax.arrays import flatten
 from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import training_cost
 from autocost_jax.envs.env import make_env
+from autocost_jax.policies import (
+    EVALUATION,
+    eval_summary,
+    load_policies,
+    score_line,
+)
 from autocost_jax.population import (
     Population,
     make_agents,
@@ -30,7 +36,6 @@ from autocost_jax.population import (
 )
 from autocost_jax.progress import Display, format_seconds
 from autocost_jax.records import Slot
-from autocost_jax.run import EVALUATION, eval_summary, load_policies
 from autocost_jax.store import RunDir, check_free_space, estimate_bytes
 from autocost_jax.train import Learner
 
@@ -265,16 +270,6 @@ def _finish(
         row |= eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
     run.write_json("evaluation", {"episodes": num_episodes, "rows": table})
     for row in table:
-        display.say(table_line(row))
+        display.say("  " + score_line(f"{row['method']} seed {row['seed']}", row))
     display.say(f"done in {format_seconds(display.elapsed)}; see {run.path}")
     return table
-
-
-def table_line(row: dict[str, Any]) -> str:
-    """One evaluated slot for people."""
-    return (
-        f"  {row['method']} seed {row['seed']}: return {row['return_mean']:.2f} +- "
-        f"{row['return_ci']:.2f}, extrinsic cost {row['cost_mean']:.3f} +- "
-        f"{row['cost_ci']:.3f}, violating episodes {row['violation_rate']:.1%} of "
-        f"{row['episodes']}"
-    )

@@ -1,6 +1,5 @@
 """One search in a run directory: watched, checkpointed, resumed, reported."""
 
-import dataclasses
 import itertools
 import sys
 import time
@@ -9,28 +8,31 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.agents.base import Agent
-from autocost_jax.arrays import flatten, load_arrays, unflatten
-from autocost_jax.config import SearchConfig, TrainConfig
+from autocost_jax.arrays import flatten
+from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import make_env
 from autocost_jax.evolution import (
     Progress,
     Searcher,
     SearchState,
+    StageResult,
     best_of,
     evolve,
     init_search,
     make_searcher,
 )
-from autocost_jax.population import make_agents, make_evaluator
+from autocost_jax.policies import (
+    EVALUATION,
+    eval_summary,
+    load_policies,
+    policy_name,
+    score_line,
+)
+from autocost_jax.population import make_evaluator
 from autocost_jax.progress import Display, format_seconds, summarise
-from autocost_jax.records import EvalResult
 from autocost_jax.store import RunDir, check_free_space, estimate_bytes
-
-EVALUATION = 2**31 - 1  # purpose of the final evaluation's key, beyond any stage
 
 
 def estimate_memory(config: SearchConfig, num_devices: int) -> int:
@@ -198,18 +200,21 @@ def _train(
             row["time/env_steps_per_second"] = display.steps_per_second
             run.log_metrics(row, first + k)
         if progress.result is not None:
-            _write_stage(run, searcher, state, progress)
+            _write_stage(run, searcher, state, progress, progress.result)
         position = {"stage": int(state.stage), "epoch": int(state.epoch)}
         run.save_checkpoint(state, first + chunk, position)
     return state
 
 
 def _write_stage(
-    run: RunDir, searcher: Searcher, state: SearchState, progress: Progress
+    run: RunDir,
+    searcher: Searcher,
+    state: SearchState,
+    progress: Progress,
+    result: StageResult,
 ) -> None:
     """The stage's npz and the policies of its best candidate."""
-    result, config = progress.result, run.config
-    assert result is not None
+    config = run.config
     scores = {f"scores/{key}": value for key, value in result.scores.items()}
     arrays = {
         "theta": result.candidates,
@@ -230,35 +235,6 @@ def _write_stage(
     for name, learner in zip(config.algorithms, progress.learners, strict=True):
         params = jax.tree.map(lambda leaf: leaf[top], learner.agent.policy)
         run.write_policy(policy_name(progress.stage, name), flatten(params))
-
-
-def policy_name(stage: int, algorithm: str) -> str:
-    """File stem of the policy of a stage's best candidate."""
-    return f"stage_{stage:02d}_{algorithm}"
-
-
-def load_policies(train: TrainConfig, files: Sequence[Path]) -> tuple[Agent, Any]:
-    """Saved policies as one stacked agent state, and the agent that acts for it.
-
-    Args:
-      train: the run's training configuration, for the shapes.
-      files: policies/*.npz.
-
-    Returns:
-      Agent, and its state with the policies stacked [P, ...].
-
-    Raises:
-      RunDirError: a file is missing or is not such a policy.
-    """
-    # Whose policy it is does not matter: all agents act alike.
-    (agent,) = make_agents(("ppo_lagrangian",), train, make_env(train.env))
-    template = agent.init(jax.random.key(0))
-    loaded = [unflatten(load_arrays(file, None), template.policy) for file in files]
-    stacked = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (len(loaded), *leaf.shape)), template
-    )
-    policy = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loaded)
-    return agent, dataclasses.replace(stacked, policy=policy)
 
 
 def _finish(
@@ -315,35 +291,8 @@ def finish_lines(card: dict[str, Any], report: Path, elapsed: float) -> list[str
         f"({card['label']})"
     ]
     for name, row in card["evaluation"].items():
-        lines.append(
-            f"  {name}: return {row['return_mean']:.2f} +- {row['return_ci']:.2f}, "
-            f"extrinsic cost {row['cost_mean']:.3f} +- {row['cost_ci']:.3f}, "
-            f"violating episodes {row['violation_rate']:.1%} of {row['episodes']}"
-        )
+        lines.append("  " + score_line(name, row))
     return [*lines, f"done in {format_seconds(elapsed)}; open {report}"]
-
-
-def eval_summary(result: EvalResult) -> dict[str, float | int]:
-    """Means with normal 95 % intervals over the valid episodes of one policy."""
-    valid = np.asarray(result.valid) > 0
-    count = int(valid.sum())
-
-    def interval(values: jax.Array) -> tuple[float, float]:
-        kept = np.asarray(values, np.float64)[valid]
-        if count < 2:
-            return float(kept.mean()) if count else float("nan"), float("nan")
-        return float(kept.mean()), float(1.96 * kept.std(ddof=1) / np.sqrt(count))
-
-    ep_return, ep_cost = interval(result.ep_return), interval(result.ep_cost)
-    return {
-        "return_mean": ep_return[0],
-        "return_ci": ep_return[1],
-        "cost_mean": ep_cost[0],
-        "cost_ci": ep_cost[1],
-        "violation_rate": float(result.violation_rate),
-        "distance_travelled": interval(result.distance_travelled)[0],
-        "episodes": count,
-    }
 
 
 def _replay_arrays(episodes: Any) -> dict[str, np.ndarray]:
