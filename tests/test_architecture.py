@@ -37,6 +37,7 @@ ORDER = (
     "report",
     "summary",
     "progress",
+    "policies",
     "run",
     "methods",
     "commandline",
