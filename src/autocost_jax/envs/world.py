@@ -73,6 +73,7 @@ def make_world(config: EnvConfig) -> World:
     mj_model = spec.compile()
     model = mjx.put_model(mj_model, impl="jax")
     rest = mjx.make_data(mj_model, impl="jax")
+    model, rest = _fill_tendons(model, rest)
     body = mj_model.body("robot").id
     num_substeps = config.frameskip_binom_n
     sensor_slices = {
@@ -120,6 +121,28 @@ def make_world(config: EnvConfig) -> World:
         dt=num_substeps * float(mj_model.opt.timestep),
         dtype=rest.qpos.dtype,
     )
+
+
+def _fill_tendons(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
+    """One row of zeros in the tendon arrays of a model that has no tendon.
+
+    MJX multiplies them also when they are empty, and partitioning an empty `where`
+    over two devices crashes the CPU compiler of jaxlib 0.11. `model.ntendon` stays 0,
+    so the row is never filled and adds exact zeros.
+    """
+    zeros = jnp.zeros((1, 2), data.qpos.dtype)
+    model = model.replace(
+        tendon_lengthspring=zeros,
+        tendon_stiffness=zeros[:, 0],
+        tendon_damping=zeros[:, 0],
+    )
+    data = data.replace(ten_length=zeros[:, 0])
+    row: Any = {
+        "_impl.ten_J": jnp.zeros((1, model.nv), data.qpos.dtype),
+        "_impl.ten_velocity": zeros[:, 0],
+    }
+    filled: Any = data.tree_replace(row)
+    return model, filled
 
 
 def _substep(
