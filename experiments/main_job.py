@@ -221,10 +221,66 @@ def collect() -> None:
             text = (RUNS / name / "evaluation.json").read_text()
             result[name] = json.loads(text)["rows"]
     (RESULTS / "main_job.json").write_text(json.dumps(result, indent=1) + "\n")
+    (RESULTS / "main_job.md").write_text(render(result))
     draw_searches(result)
     if "long" in result:
         draw_long(result["long"])
     print(RESULTS / "main_job.json")
+
+
+def render(result: dict[str, Any]) -> str:
+    """The tables of the README, from the JSON."""
+
+    def numbers(values: list[float], digits: int = 1) -> str:
+        return ", ".join(f"{value:.{digits}f}" for value in values)
+
+    lines = [
+        "| search | selection | cost, mean of each stage | fall (95 %) "
+        "| return, mean of each stage | under 1 m | at zero |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    named = [
+        (f"laptop, seed {search['seed']}", search) for search in result["searches"]
+    ]
+    named += [("wide, seed 0", result["wide"])] if "wide" in result else []
+    for name, search in named:
+        low, high = search["fall_95"]
+        timid = max(search["timid_share"])
+        zero = f"{sum(search['stage_zero'])} of {sum(map(len, search['cost']))}"
+        lines.append(
+            f"| {name} | {search['selection']} | {numbers(search['stage_mean_cost'])} "
+            f"| {search['fall']:.1f} ({low:.1f} to {high:.1f}) "
+            f"| {numbers(search['stage_mean_return'])} | {timid:.0%} | {zero} |"
+        )
+    for title, key in (
+        ("trained for one stage's budget", "baseline"),
+        (f"trained for {LONG_EPOCHS} epochs", "long"),
+    ):
+        if key in result:
+            lines += ["", *method_table(title, result[key])]
+    return "\n".join(lines) + "\n"
+
+
+def method_table(title: str, rows: list[dict[str, Any]]) -> list[str]:
+    """Means over seeds of one evaluated table of methods."""
+    lines = [
+        f"| {title} | seeds x episodes | return | extrinsic cost "
+        "| violating episodes |",
+        "|---|---|---|---|---|",
+    ]
+    for label in dict.fromkeys(row["method"] for row in rows):
+        chosen = [row for row in rows if row["method"] == label]
+
+        def spread(key: str, chosen: list[dict[str, Any]] = chosen) -> str:
+            values = [row[key] for row in chosen]
+            return f"{np.mean(values):.2f} ({min(values):.2f} to {max(values):.2f})"
+
+        rate = np.mean([row["violation_rate"] for row in chosen])
+        lines.append(
+            f"| {label.replace('_', ' ')} | {len(chosen)} x {chosen[0]['episodes']} "
+            f"| {spread('return_mean')} | {spread('cost_mean')} | {rate:.0%} |"
+        )
+    return lines
 
 
 def draw_searches(result: dict[str, Any]) -> None:

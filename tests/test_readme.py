@@ -1,5 +1,7 @@
 """What the README says is so."""
 
+import importlib.util
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -93,3 +95,19 @@ def test_the_wheel_would_hold_everything_that_is_read_at_run_time():
     package = ROOT / "src" / "autocost_jax"
     for name in ("py.typed", "envs/xmls/point.xml", "report_assets/page.html"):
         assert (package / name).exists()
+
+
+def test_the_results_are_those_of_the_committed_json():
+    spec = importlib.util.spec_from_file_location(
+        "main_job", ROOT / "experiments" / "main_job.py"
+    )
+    assert spec is not None
+    assert spec.loader is not None
+    main_job = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(main_job)
+    result = json.loads((ROOT / main_job.RESULTS / "main_job.json").read_text())
+    tables = main_job.render(result).strip()
+    (shown,) = re.findall(
+        r"<!-- main_job\.md -->\n(.*?)\n<!-- end -->", README, re.DOTALL
+    )
+    assert shown.strip() == tables
