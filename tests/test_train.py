@@ -12,6 +12,7 @@ from autocost_jax.costs import BANK, CostTerm, intrinsic_cost, training_cost
 from autocost_jax.population import stack_slots
 from autocost_jax.records import CostInputs, Slot, Trajectory
 from autocost_jax.train import (
+    awareness,
     episode_metrics,
     init_learner,
     run_epoch,
@@ -135,7 +136,7 @@ def test_metrics_of_whole_episodes(key):
     trajectory = make_trajectory(key, jnp.ones((10, 6)))
     theta = jax.random.normal(key, (41,))
     total = jax.random.uniform(key, (10, 6))
-    got = episode_metrics(trajectory, total, theta, 10)
+    got = episode_metrics(trajectory, total, 10) | awareness(trajectory, theta)
     inputs = jax.tree.map(lambda x: np.asarray(x, np.float64), trajectory.cost_inputs)
     sums = {
         "ep_return": np.asarray(trajectory.reward, np.float64).sum(axis=0),
@@ -161,19 +162,20 @@ def test_metrics_leave_failed_steps_out(key):
     """Rates of the valid steps times the length; worlds that failed are counted."""
     valid = jnp.ones((10, 6)).at[4:, 1].set(0.0).at[:, 5].set(0.0)
     trajectory = make_trajectory(key, valid)
-    got = episode_metrics(trajectory, trajectory.reward, jnp.zeros(41), 10)
+    got = episode_metrics(trajectory, trajectory.reward, 10)
     kept = np.asarray(trajectory.reward)[np.asarray(valid) > 0]
     assert kept.size == 44
     assert float(got["ep_return"]) == pytest.approx(10 * kept.mean(), abs=ROUNDING)
     assert float(got["failed_worlds"]) == 2
 
 
-def test_nowhere_far_or_near_is_zero(key):
+def test_nowhere_far_or_near_is_nan(key):
     trajectory = make_trajectory(key, jnp.ones((4, 2)))
     inputs = trajectory.cost_inputs.replace(distance=jnp.full((4, 2), 2.0))
     trajectory = trajectory.replace(cost_inputs=inputs)
-    got = episode_metrics(trajectory, trajectory.reward, jnp.zeros(41), 4)
-    assert float(got["intrinsic_far"]) == float(got["intrinsic_near"]) == 0.0
+    got = awareness(trajectory, jnp.zeros(41))
+    assert np.isnan(got["intrinsic_far"])
+    assert np.isnan(got["intrinsic_near"])
 
 
 def test_counters_are_means_over_episodes(env):

@@ -7,7 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from autocost_jax.commandline import BAD_INPUT, guarded, parse, quiet, use_devices
+from autocost_jax.commandline import (
+    BAD_INPUT,
+    flag,
+    guarded,
+    parse,
+    quiet,
+    use_devices,
+)
 
 HELP = """usage: autocost COMMAND [flags]
 
@@ -56,7 +63,7 @@ def _train(argv: list[str]) -> None:
           num_seeds: seeds 0 ... N - 1.
           preset: whose sizes the other flags default to.
           out: run directory.
-          resume: continue the run in `out`.
+          resume: continue the run in `out` with its own settings.
           overwrite: start over in a directory that already holds a run.
           devices: devices to use; default: all; a CPU counts one a core.
           episodes: fresh episodes a policy is scored in.
@@ -81,25 +88,30 @@ def _train(argv: list[str]) -> None:
             default_factory=TrainConfig
         )
 
-    name = argv[argv.index("--preset") + 1 :][:1] if "--preset" in argv else ["laptop"]
-    default = Options(train=preset(name[0] if name else "").train)
+    default = Options(train=preset(flag(argv, "--preset") or "laptop").train)
     options = parse(Options, argv, "autocost train", default=default)
+    devices = use_devices(options.devices)  # before anything of JAX runs
     from autocost_jax.methods import Method, TableConfig, run_table
+    from autocost_jax.store import read_config
 
-    config = TableConfig(
-        train=_with_env(options.train, options.env),
-        methods=tuple(
-            Method(name, name, options.cost, options.limit, _theta(options.theta))
-            for name in options.algorithms
-        ),
-        seeds=tuple(range(options.num_seeds)),
-    )
+    if options.resume:
+        config, _ = read_config(options.out, TableConfig)
+    else:
+        theta = _theta(options.theta)
+        config = TableConfig(
+            train=_with_env(options.train, options.env),
+            methods=tuple(
+                Method(name, name, options.cost, options.limit, theta)
+                for name in options.algorithms
+            ),
+            seeds=tuple(range(options.num_seeds)),
+        )
     run_table(
         config,
         options.out,
         resume=options.resume,
         overwrite=options.overwrite,
-        devices=use_devices(options.devices),
+        devices=devices,
         num_episodes=options.episodes,
     )
 
@@ -147,10 +159,16 @@ def _evaluate(argv: list[str]) -> None:
         raise ValueError(f"episodes must be >= 1, got {options.episodes}")
     import jax
 
-    from autocost_jax.arrays import RunDirError
+    from autocost_jax.arrays import RunDirError, write_atomic
     from autocost_jax.envs.env import make_env
-    from autocost_jax.policies import eval_summary, load_policies, score_line
+    from autocost_jax.policies import (
+        EVALUATION,
+        eval_summary,
+        load_policies,
+        score_line,
+    )
     from autocost_jax.population import make_evaluator
+    from autocost_jax.rundata import to_json
 
     config = _run_config(options.run)
     known = sorted(file.stem for file in (options.run / "policies").glob("*.npz"))
@@ -165,14 +183,16 @@ def _evaluate(argv: list[str]) -> None:
     agent, states = load_policies(config.train, files)
     env = make_env(config.train.env)
     run = make_evaluator(env, agent, options.episodes, options.deterministic)
-    results, _ = run(states, jax.random.key(options.seed))
+    key = jax.random.fold_in(jax.random.key(options.seed), EVALUATION)
+    results, _ = run(states, key)
     rows = []
     for i, name in enumerate(names):
         row = eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
         rows.append({"policy": name, **row})
         print(score_line(name, row))
     if options.json is not None:
-        options.json.write_text(json.dumps(rows, indent=2) + "\n")
+        text = json.dumps(to_json(rows), indent=2, allow_nan=False)
+        write_atomic(options.json, text.encode() + b"\n")
 
 
 def _run_config(path: Path) -> Any:

@@ -38,6 +38,16 @@ def _first_sentence(panel: str) -> str:
     return re.split(advice, text)[0]
 
 
+def flag(argv: Sequence[str], name: str) -> str | None:
+    """The value of a flag, before the flags are parsed."""
+    for index, word in enumerate(argv):
+        if word == name and index + 1 < len(argv):
+            return argv[index + 1]
+        if word.startswith(f"{name}="):
+            return word.partition("=")[2]
+    return None
+
+
 def fail(message: str, status: int = BAD_INPUT) -> None:
     """End the program with one line on stderr."""
     sys.stderr.write(" ".join(message.split()) + "\n")
@@ -55,10 +65,12 @@ def guarded(main: Callable[[], None], prog: str) -> None:
         main()
     except ValueError as error:
         fail(f"{prog}: {error}")
+    except OSError as error:
+        fail(f"{prog}: {error.strerror or error}: {error.filename or ''}")
     except (DiskFullError, RuntimeError) as error:
         fail(f"{prog}: {error}", status=1)
     except KeyboardInterrupt:
-        fail(f"{prog}: interrupted; continue with --resume", status=130)
+        fail(f"{prog}: interrupted; a run goes on with --resume", status=130)
 
 
 def quiet() -> None:
@@ -80,9 +92,9 @@ def use_devices(count: int | None) -> Sequence[Any]:
     """
     import jax
 
-    cores = os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     with contextlib.suppress(RuntimeError):  # too late to split: take what is there
-        jax.config.update("jax_num_cpu_devices", max(count or cores, 1))
+        jax.config.update("jax_num_cpu_devices", cores)
     devices = jax.devices()
     if count is not None and not 1 <= count <= len(devices):
         raise ValueError(f"devices must be in [1, {len(devices)}], got {count}")

@@ -165,9 +165,10 @@ class AgentConfig:
         )
         _require_finite(self, "log_std_init")
         _require(
-            all(_is_integer(size) and size >= 1 for size in self.hidden_sizes),
+            len(self.hidden_sizes) > 0
+            and all(_is_integer(size) and size >= 1 for size in self.hidden_sizes),
             "hidden_sizes",
-            "a tuple of integers >= 1",
+            "one or more integers >= 1",
             self.hidden_sizes,
         )
         for name in ("gamma", "cost_gamma"):
@@ -247,7 +248,7 @@ class SearchConfig:
     additively or multiplicatively with probability 1/2, factors element-wise uniform
     in [`mutation_low`, `mutation_high`], elites kept and retrained with new seeds,
     "converged" = the mean over the last `fitness_epochs` epochs, "zero violation" =
-    a summed extrinsic cost <= `zero_tolerance` over those episodes.
+    a mean extrinsic cost <= `zero_tolerance` over those episodes.
     `selection="random"` replaces the ranking by a random choice: the control.
     """
 
@@ -296,6 +297,8 @@ class SearchConfig:
             self, "init_std", "mutation_std", "mutation_low", "mutation_high"
         )
         _require_finite(self, "cost_limit")
+        segments = self.train.segments_per_episode
+        _require(segments == 1, "segments_per_episode", "1 in a search", segments)
         low, high = self.mutation_low, self.mutation_high
         _require(high >= low, "mutation_high", f">= mutation_low={low}", high)
         tolerance = self.zero_tolerance

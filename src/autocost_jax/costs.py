@@ -150,6 +150,8 @@ def training_cost(
       ValueError: unknown term (the message lists the bank), bad weight, theta of
         another shape, or no theta although the method uses the network.
     """
+    if isinstance(limit, float | int) and not np.isfinite(limit):
+        raise ValueError(f"limit must be finite, got {limit}")
     names = [term.name for term in bank]
     weights = np.zeros(len(bank), np.float32)
     for part in method.split("+"):

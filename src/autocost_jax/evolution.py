@@ -182,8 +182,11 @@ def stage_result(
       history: `TRACKED` metrics [num_epochs, A, P].
       frozen: [A, P] bool.
     """
+    # A state that was not visited in an epoch has no intrinsic cost there: NaN.
     last = {
-        name: jnp.mean(value[-config.fitness_epochs :], axis=0)
+        name: (jnp.nanmean if name.startswith("intrinsic") else jnp.mean)(
+            value[-config.fitness_epochs :], axis=0
+        )
         for name, value in history.items()
     }
     broken = jnp.any(frozen, axis=0)
@@ -309,20 +312,19 @@ def evolve(
       happened. A yielded state's learners are consumed by the next chunk.
 
     Raises:
-      RuntimeError: if every candidate of a stage failed; the message names the stage.
+      RuntimeError: after a stage, if all its candidates failed; it names the stage.
     """
     searcher = make_searcher(config) if searcher is None else searcher
     state = init_search(searcher) if state is None else state
     while int(state.stage) < config.num_stages:
         state, progress = _run_chunk(searcher, state)
-        if progress.result is not None:
-            failed = ~np.isfinite(np.asarray(progress.result.fitness.cost))
-            if failed.all():
-                raise RuntimeError(
-                    f"every candidate of stage {progress.stage} failed "
-                    "(non-finite numbers in all agents)"
-                )
         yield state, progress
+        result = progress.result
+        if result is not None and not np.isfinite(result.fitness.cost).any():
+            raise RuntimeError(
+                f"every candidate of stage {progress.stage} failed "
+                "(non-finite numbers in all agents)"
+            )
 
 
 def _begin_stage(searcher: Searcher, es_state: ESState, stage: int) -> SearchState:

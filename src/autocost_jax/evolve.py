@@ -14,7 +14,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, Literal
 
-from autocost_jax.commandline import fail, guarded, parse, quiet, use_devices
+from autocost_jax.commandline import (
+    fail,
+    flag,
+    guarded,
+    parse,
+    quiet,
+    use_devices,
+)
 from autocost_jax.config import PRESETS, SearchConfig, preset
 from autocost_jax.envs.env import list_envs, make_env
 from autocost_jax.evolution import evolve, search
@@ -33,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _main(argv: list[str]) -> None:
     defaults = _defaults(argv)
     options = parse(_options_type(), argv, PROG, default=defaults, description=__doc__)
+    devices = use_devices(options.devices)  # before anything of JAX runs
     config = options.search
     if options.env is not None:
         env = make_env(options.env).config  # unknown: lists the valid ones
@@ -44,7 +52,6 @@ def _main(argv: list[str]) -> None:
     from autocost_jax.run import describe, run_search
 
     path = options.out or Path("runs") / f"{options.preset}-seed{config.seed}"
-    devices = use_devices(options.devices)
     if options.dry_run:
         print("\n".join([*describe(config, len(devices)), f"would write to {path}"]))
         return
@@ -100,31 +107,21 @@ def _options_type() -> Any:
 
 def _defaults(argv: list[str]) -> Any:
     """Options with the values of a preset or of a run; on --resume of that run."""
-    name = _flag(argv, "--preset") or "laptop"
+    name = flag(argv, "--preset") or "laptop"
     if name not in PRESETS:
         fail(f"{PROG}: unknown preset {name!r}; presets: {', '.join(PRESETS)}")
     config = preset(name)
-    out, source = _flag(argv, "--out"), _flag(argv, "--config")
-    if source is None and "--resume" in argv and _flag(argv, "--preset") is None:
+    out, source = flag(argv, "--out"), flag(argv, "--config")
+    if source is None and "--resume" in argv and flag(argv, "--preset") is None:
         source = out
     if source is not None:
         from autocost_jax.store import read_config
 
         config, _ = read_config(Path(source))
-    env = _flag(argv, "--env")
+    env = flag(argv, "--env")
     if env is not None and env not in list_envs():
         make_env(env)
     return _options_type()(preset=name, search=config)
-
-
-def _flag(argv: list[str], name: str) -> str | None:
-    """The value of a flag, before the flags are parsed."""
-    for index, word in enumerate(argv):
-        if word == name and index + 1 < len(argv):
-            return argv[index + 1]
-        if word.startswith(f"{name}="):
-            return word.partition("=")[2]
-    return None
 
 
 class _CallableModule(ModuleType):

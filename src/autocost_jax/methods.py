@@ -25,6 +25,7 @@ from autocost_jax.policies import (
     EVALUATION,
     eval_summary,
     load_policies,
+    require_episodes,
     score_line,
 )
 from autocost_jax.population import (
@@ -169,11 +170,13 @@ def run_table(
       RunDirError: the directory is not usable for this run.
       DiskFullError: the disk is full; the directory is intact.
     """
-    devices = list(devices or jax.devices()[:1])
+    require_episodes(num_episodes)
+    slots = table_slots(config)
+    largest = max(group.key.shape[0] for group in slots)
+    devices = list(devices or jax.devices()[:1])[:largest]
     env = make_env(config.train.env)
     agents = make_agents(config.algorithms, config.train, env)
     population = make_population(env, agents, config.train, devices=devices)
-    slots = table_slots(config)
     if resume:
         run = RunDir.open(path, config)
     else:
@@ -191,6 +194,8 @@ def run_table(
         checkpoint = run.resume(state) if resume else None
         if checkpoint is not None:
             state = checkpoint.tree
+            for line in checkpoint.warnings:
+                display.say(line)
             display.say(f"resuming {path} after {int(state.epoch)} epochs")
         run.start_tensorboard(purge_step=int(state.epoch) or None)
         state = _train(run, config, population, slots, state, display)
@@ -260,7 +265,11 @@ def _finish(
             )
             stem = f"{method.label}_seed{seed}"
             files.append(run.write_policy(stem, flatten(params)))
-            table.append({"method": method.label, "seed": seed})
+            frozen = int(state.learners[i].frozen_epoch[index])
+            row = {"method": method.label, "seed": seed, "frozen_epoch": frozen}
+            table.append(row)
+            if frozen >= 0:
+                display.say(f"{stem} met a non-finite number in epoch {frozen}")
     display.say(f"evaluating {len(files)} policies over {num_episodes} episodes ...")
     agent, states = load_policies(config.train, files)
     env = make_env(config.train.env)

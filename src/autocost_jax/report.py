@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from autocost_jax.arrays import write_atomic
 from autocost_jax.report_assets.cost_field import network_cost, object_lidar
 from autocost_jax.report_assets.data import (
     TIMID_DISTANCE,
@@ -100,7 +101,7 @@ def write_report(data: ReportData, path: str | Path) -> Path:
     """Writes the report, creating its folder; returns the path of the file."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(render_report(data), encoding="utf-8")
+    write_atomic(path, render_report(data).encode())
     return path
 
 

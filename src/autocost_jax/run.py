@@ -1,6 +1,7 @@
 """One search in a run directory: watched, checkpointed, resumed, reported."""
 
 import itertools
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ from autocost_jax.policies import (
     eval_summary,
     load_policies,
     policy_name,
+    require_episodes,
     score_line,
 )
 from autocost_jax.population import make_evaluator
@@ -54,6 +56,18 @@ def estimate_memory(config: SearchConfig, num_devices: int) -> int:
     return 4 * per_slot * -(-slots // num_devices)
 
 
+def estimate_disk(config: SearchConfig) -> int:
+    """Bytes of four checkpoints (three are kept), which hold nearly all of a run."""
+    env = make_env(config.train.env)
+    hidden = config.train.agent.hidden_sizes
+    networks = [(env.observation_size, *hidden, out) for out in (env.action_size, 1, 1)]
+    weights = sum(
+        (a + 1) * b for sizes in networks for a, b in itertools.pairwise(sizes)
+    )
+    slots = config.population_size * len(config.algorithms)
+    return 4 * 4 * 3 * weights * slots  # float32 parameters and two Adam moments
+
+
 def describe(config: SearchConfig, num_devices: int) -> list[str]:
     """What a run will do, as lines for people."""
     train, agent = config.train, config.train.agent
@@ -68,7 +82,9 @@ def describe(config: SearchConfig, num_devices: int) -> list[str]:
         f"{agent.value_passes} x {agent.value_minibatches} steps an epoch",
         f"{config.env_steps:,} env steps in all; on {num_devices} device(s) of kind "
         f"{jax.devices()[0].device_kind}; about "
-        f"{estimate_memory(config, num_devices) / 1e9:.2f} GB of memory on each",
+        f"{estimate_memory(config, num_devices) / 1e9:.2f} GB of memory on each and "
+        f"{estimate_disk(config) / 1e6:.0f} MB of disk; the time left is shown as "
+        "soon as the first epoch is done",
     ]
 
 
@@ -80,6 +96,9 @@ def check_memory(config: SearchConfig, devices: Sequence[Any]) -> None:
     """
     stats = devices[0].memory_stats() or {}
     limit = stats.get("bytes_limit")
+    if devices[0].platform == "cpu":  # its devices share the machine's memory
+        machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        limit = machine // len(devices)
     need = estimate_memory(config, len(devices))
     if limit is not None and need > limit:
         raise ValueError(
@@ -117,8 +136,11 @@ def run_search(
       ValueError: the configuration does not fit the devices.
       RuntimeError: every candidate of a stage failed.
     """
-    devices = list(devices or jax.devices()[:1])
+    require_episodes(num_episodes)
+    # A device without a candidate of its own would only train copies.
+    devices = list(devices or jax.devices()[:1])[: config.population_size]
     check_memory(config, devices)
+    searcher = make_searcher(config, devices)
     if resume:
         run = RunDir.open(path, config)
     else:
@@ -127,7 +149,6 @@ def run_search(
     with run, Display(total, 0, sys.stdout) as display:
         for line in [*run.warnings, *describe(config, len(devices))]:
             display.say(line)
-        searcher = make_searcher(config, devices)
         state = _start(run, searcher, display, resume)
         if int(state.stage) < config.num_stages:
             _compile(searcher, state, display)

@@ -338,7 +338,7 @@ class RunDir:
 def _run_files(path: Path) -> list[Path]:
     """What a run owns in its directory, but for its config and its lock."""
     names = (METRICS, "tensorboard", "checkpoints", "policies", "report")
-    arrays = ("stage_*.npz", "cost.npz", "cost.json", "replay.npz")
+    arrays = ("stage_*.npz", "cost.npz", "cost.json", "replay.npz", "evaluation.json")
     patterns = (*names, *arrays, f"{TEMPORARY}*")
     return [file for pattern in patterns for file in path.glob(pattern)]
 

@@ -30,9 +30,7 @@ def load_report(path: str | Path) -> ReportData:
     path = Path(path)
     config, facts = read_config(path, SearchConfig)
     rows = read_metrics(path)
-    stages = tuple(
-        _stage(config, load_arrays(file, None)) for file in list_stages(path).values()
-    )
+    stages = tuple(_stage(config, file) for file in list_stages(path).values())
     card = _read_card(path)
     return ReportData(
         title=f"AutoCost on {config.train.env.name}",
@@ -64,8 +62,15 @@ def _read_card(path: Path) -> dict[str, Any]:
         raise RunDirError(f"{file} is not readable: {error}") from None
 
 
-def _stage(config: SearchConfig, arrays: dict[str, np.ndarray]) -> StageRecord:
-    far, near = arrays["scores/intrinsic_far"], arrays["scores/intrinsic_near"]
+def _stage(config: SearchConfig, file: Path) -> StageRecord:
+    try:
+        return _stage_record(config, load_arrays(file))
+    except (KeyError, IndexError) as error:
+        raise RunDirError(f"{file} is not the file of a stage: {error}") from None
+
+
+def _stage_record(config: SearchConfig, arrays: dict[str, np.ndarray]) -> StageRecord:
+    parents = [np.flatnonzero((arrays["theta"] == e).all(1)) for e in arrays["elites"]]
     return StageRecord(
         theta=arrays["theta"],
         cost=arrays["cost"],
@@ -73,11 +78,18 @@ def _stage(config: SearchConfig, arrays: dict[str, np.ndarray]) -> StageRecord:
         algorithm_cost=arrays["scores/ep_cost"],
         algorithm_return=arrays["scores/ep_return"],
         zero_violation=arrays["cost"] <= config.zero_tolerance,
-        elites=arrays["order"][: config.num_elites],
-        far_cost=far.mean(0),
-        near_cost=near.mean(0),
+        elites=np.asarray([match[0] for match in parents]),
+        far_cost=_known_mean(arrays["scores/intrinsic_far"]),
+        near_cost=_known_mean(arrays["scores/intrinsic_near"]),
         distance_travelled=arrays["scores/distance_travelled"],
     )
+
+
+def _known_mean(values: np.ndarray) -> np.ndarray:
+    """Mean over algorithms [A, P] -> [P] without NaN; NaN where all are."""
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0).sum(0)
+    return np.where(known.any(0), total / np.maximum(known.sum(0), 1), np.nan)
 
 
 def _best(

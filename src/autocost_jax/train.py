@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from autocost_jax.agents.advantages import weighted_mean
 from autocost_jax.agents.base import Agent
 from autocost_jax.config import TrainConfig
 from autocost_jax.costs import BANK, CostTerm, intrinsic_cost, total_cost
@@ -125,11 +126,12 @@ def init_worlds(
     segments = config.segments_per_episode
     if segments == 1:
         return None
-    keys = jnp.concatenate([slot.key for slot in slots])
+    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *slots)
     num_carried = config.num_worlds * (segments - 1)
+    before = jnp.asarray(-segments, jnp.int32)  # no other epoch has this number
     carried = jax.vmap(
-        lambda key: reset_worlds(env, jax.random.fold_in(key, INIT), num_carried)
-    )(keys)
+        lambda slot: reset_worlds(env, slot_key(slot, before, RESET), num_carried)
+    )(joined)
 
     def warm_up(carried: EnvState | None, segment: jax.Array):
         # Negative epochs: their keys are not those of any training epoch.
@@ -265,9 +267,7 @@ def _update(
     updated, metrics = agent.update(
         learner.agent, trajectory, total, slot, slot_key(slot, epoch, UPDATE)
     )
-    metrics = metrics | episode_metrics(
-        trajectory, total, slot.cost.theta, env.episode_length
-    )
+    metrics = metrics | episode_metrics(trajectory, total, env.episode_length)
     episodes = 1.0 / config.segments_per_episode  # share of an episode in an epoch
     for name, value in counts.items():
         metrics[name] = jnp.mean(value) / episodes
@@ -275,6 +275,7 @@ def _update(
     frozen = learner.frozen | ~healthy
     first = frozen & ~learner.frozen
     metrics["frozen"] = frozen.astype(jnp.float32)
+    metrics |= awareness(trajectory, slot.cost.theta)
     return Learner(
         agent=jax.tree.map(
             lambda old, new: jnp.where(frozen, old, new), learner.agent, updated
@@ -285,34 +286,43 @@ def _update(
 
 
 def episode_metrics(
-    trajectory: Trajectory, total: jax.Array, theta: jax.Array, episode_length: int
+    trajectory: Trajectory, total: jax.Array, episode_length: int
 ) -> Metrics:
     """What one slot's episodes looked like, scalars.
 
     `ep_return`, `ep_cost` (extrinsic) and `ep_total_cost` (what the learner sees) are
     undiscounted episode sums, estimated as episode_length x the mean over valid steps:
     for whole episodes exactly their mean. `violating_worlds` is the share of worlds
-    with an extrinsic cost > 0 in this epoch, `intrinsic_far` and `intrinsic_near` the
-    mean intrinsic cost over visited states with D > 3 R and D < 1.5 R (0 if none).
+    with an extrinsic cost > 0 in this epoch, `failed_worlds` their number.
     """
-    inputs, valid = trajectory.cost_inputs, trajectory.valid
-
-    def mean(x: jax.Array, weight: jax.Array) -> jax.Array:
-        # The weights are counts: the floor only keeps 0 / 0 away.
-        return jnp.sum(weight * x) / jnp.maximum(jnp.sum(weight), 1.0)
-
-    intrinsic = intrinsic_cost(theta, inputs.constraint_lidar)
-    far = valid * (inputs.distance > 3.0 * inputs.radius)
-    near = valid * (inputs.distance < 1.5 * inputs.radius)
-    world_cost = jnp.sum(valid * inputs.cost, axis=0)
+    cost, valid = trajectory.cost_inputs.cost, trajectory.valid
+    world_cost = jnp.sum(valid * cost, axis=0)
     return {
-        "ep_return": episode_length * mean(trajectory.reward, valid),
-        "ep_cost": episode_length * mean(inputs.cost, valid),
-        "ep_total_cost": episode_length * mean(total, valid),
+        "ep_return": episode_length * weighted_mean(trajectory.reward, valid),
+        "ep_cost": episode_length * weighted_mean(cost, valid),
+        "ep_total_cost": episode_length * weighted_mean(total, valid),
         "violating_worlds": jnp.mean((world_cost > 0).astype(valid.dtype)),
         "failed_worlds": jnp.sum(1.0 - valid[-1]),
-        "intrinsic_far": mean(intrinsic, far),
-        "intrinsic_near": mean(intrinsic, near),
+    }
+
+
+def awareness(trajectory: Trajectory, theta: jax.Array) -> Metrics:
+    """Mean intrinsic cost of visited states far from and near to constraint objects.
+
+    `intrinsic_far` is over D > 3 R, `intrinsic_near` over D < 1.5 R; NaN if no such
+    state was visited.
+    """
+    inputs = trajectory.cost_inputs
+    cost = intrinsic_cost(theta, inputs.constraint_lidar)
+
+    def mean(where: jax.Array) -> jax.Array:
+        weight = trajectory.valid * where
+        visited = jnp.sum(weight) > 0
+        return jnp.where(visited, weighted_mean(cost, weight), jnp.nan)
+
+    return {
+        "intrinsic_far": mean(inputs.distance > 3.0 * inputs.radius),
+        "intrinsic_near": mean(inputs.distance < 1.5 * inputs.radius),
     }
 
 
