@@ -217,6 +217,7 @@ def selection_effect(searches: list[dict[str, Any]], seed: int) -> dict[str, Any
 
 def collect() -> None:
     """Write the JSON and the figures of whatever has been run."""
+    use_devices(None)  # so that the facts name the devices that the runs had
     RESULTS.mkdir(parents=True, exist_ok=True)
     searches = [
         collect_search(search_dir(selection, seed))
