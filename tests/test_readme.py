@@ -111,3 +111,10 @@ def test_the_results_are_those_of_the_committed_json():
         r"<!-- main_job\.md -->\n(.*?)\n<!-- end -->", README, re.DOTALL
     )
     assert shown.strip() == tables
+
+
+def test_the_speeds_are_those_of_the_committed_json():
+    file = ROOT / "benchmarks" / "results" / "population_laptop.json"
+    for name, row in json.loads(file.read_text())["rows"].items():
+        seconds, rate = row["compile_seconds"], row["env_steps_per_second"]
+        assert table_row(name) == f"{seconds:.1f} s | {rate:,}"
