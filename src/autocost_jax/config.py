@@ -165,10 +165,9 @@ class AgentConfig:
         )
         _require_finite(self, "log_std_init")
         _require(
-            len(self.hidden_sizes) > 0
-            and all(_is_integer(size) and size >= 1 for size in self.hidden_sizes),
+            all(_is_integer(size) and size >= 1 for size in self.hidden_sizes),
             "hidden_sizes",
-            "one or more integers >= 1",
+            "a tuple of integers >= 1",
             self.hidden_sizes,
         )
         for name in ("gamma", "cost_gamma"):

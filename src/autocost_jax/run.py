@@ -49,7 +49,7 @@ def estimate_memory(config: SearchConfig, num_devices: int) -> int:
     rows = config.train.num_worlds * env.episode_length
     sizes = (env.observation_size, *config.train.agent.hidden_sizes, env.action_size)
     weights = sum(a * b for a, b in itertools.pairwise(sizes))
-    width = max(config.train.agent.hidden_sizes)
+    width = max(config.train.agent.hidden_sizes, default=0)
     batch = rows // config.train.agent.value_minibatches
     activations = 4 * batch * width * len(config.train.agent.hidden_sizes)
     per_slot = 2 * row * rows + activations + 4 * 3 * 3 * weights
