@@ -1,9 +1,42 @@
 """What all tests share: the CPU, one key, one compilation of equal programs."""
 
+import json
 import os
+from pathlib import Path
 
 import jax
 import pytest
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--results FILE` keeps what a slow run found; see tests/results/."""
+    parser.addoption("--results", type=Path, help="write outcomes and facts as JSON")
+
+
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
+    """Write the JSON of `--results`."""
+    file = config.getoption("--results")
+    if file is None:
+        return
+    from autocost_jax.store import run_facts
+
+    reports = [
+        report
+        for outcome in ("passed", "failed", "skipped", "error")
+        for report in terminalreporter.stats.get(outcome, [])
+    ]
+    result = {
+        "command": f"pytest -m {config.getoption('markexpr')!r} --results {file}",
+        "facts": run_facts(),
+        "tests": {
+            report.nodeid: {"outcome": report.outcome, "seconds": report.duration}
+            for report in reports
+        },
+    }
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(result, indent=1) + "\n")
 
 
 def pytest_configure(config: pytest.Config) -> None:
