@@ -179,6 +179,13 @@ def bootstrap_fall(first: np.ndarray, last: np.ndarray) -> list[float]:
     return [float(x) for x in np.percentile(draws, [2.5, 97.5])]
 
 
+def count_useful(stage: dict[str, np.ndarray]) -> int:
+    """Candidates quiet far from hazards and loud near them, over visited states."""
+    far = stage["scores/intrinsic_far"].mean(0)
+    near = stage["scores/intrinsic_near"].mean(0)
+    return int(((far < 0.01) & (near > 0.1)).sum())
+
+
 def collect_search(path: Path) -> dict[str, Any]:
     """Stage means and the fall of one search."""
     config, _ = read_config(path)
@@ -192,6 +199,7 @@ def collect_search(path: Path) -> dict[str, Any]:
         "stage_mean_cost": [float(stage["cost"].mean()) for stage in stages],
         "stage_mean_return": [float(stage["ep_return"].mean()) for stage in stages],
         "stage_zero": [int((stage["cost"] <= 0).sum()) for stage in stages],
+        "quiet_far_loud_near": sum(count_useful(stage) for stage in stages),
         "timid_share": [float((x < TIMID_DISTANCE).mean()) for x in travelled],
         "fall": float(stages[0]["cost"].mean() - stages[-1]["cost"].mean()),
         "fall_95": bootstrap_fall(stages[0]["cost"], stages[-1]["cost"]),
