@@ -214,8 +214,7 @@ def _train(
     start, first = time.monotonic(), int(state.epoch)
     for epoch in range(first, total, chunk):
         learners, metrics = population.chunk(state.learners, slots, epoch)
-        state = TableState(learners=learners, epoch=jnp.asarray(epoch + chunk))
-        state = state.replace(epoch=state.epoch.astype(jnp.int32))
+        state = TableState(learners, jnp.asarray(epoch + chunk, jnp.int32))
         metrics = jax.tree.map(np.asarray, metrics)
         for k in range(chunk):
             row: dict[str, Any] = {"epoch": epoch + k}
@@ -224,16 +223,13 @@ def _train(
             run.log_metrics(row, epoch + k)
         run.save_checkpoint(state, epoch + chunk)
         left = (time.monotonic() - start) / (epoch + chunk - first)
+        named = zip(config.algorithms, metrics, strict=True)
         display.say(
             f"epoch {epoch + chunk}/{total}  "
-            + "  ".join(_line(config, name, metrics[i]) for i, name in _groups(config))
+            + "  ".join(_line(config, name, group) for name, group in named)
             + f"  time left {format_seconds(left * (total - epoch - chunk))}"
         )
     return state
-
-
-def _groups(config: TableConfig) -> list[tuple[int, str]]:
-    return list(enumerate(config.algorithms))
 
 
 def _line(config: TableConfig, name: str, metrics: dict[str, np.ndarray]) -> str:
@@ -257,7 +253,7 @@ def _finish(
 ) -> list[dict[str, Any]]:
     """Save every policy, score it over fresh episodes, write evaluation.json."""
     files, table = [], []
-    for i, name in _groups(config):
+    for i, name in enumerate(config.algorithms):
         for index, (method, seed) in enumerate(config.group(name)):
             params = jax.tree.map(
                 lambda leaf, i=i, index=index: leaf[index],
