@@ -217,7 +217,7 @@ class RunDir:
         return None
 
     def log_metrics(self, row: Mapping[str, Any], step: int) -> None:
-        """Append a row to metrics.jsonl, and its means to TensorBoard.
+        """Append a row to metrics.jsonl; TensorBoard gets means of finite entries.
 
         Args:
           row: numbers, strings, arrays, and lists or dicts of them; "step" is added.
@@ -233,8 +233,10 @@ class RunDir:
                 return
             for name, value in row.items():
                 array = np.asarray(value)
-                if array.dtype.kind in "biuf" and array.size:
-                    self._events.add_scalar(name, float(array.mean()), step)
+                # A NaN says "no such state"; tensorboardX would print a warning.
+                known = array[np.isfinite(array)] if array.dtype.kind in "biuf" else ()
+                if len(known):
+                    self._events.add_scalar(name, float(np.mean(known)), step)
 
     def save_checkpoint(
         self, tree: Any, step: int, extra: dict[str, Any] | None = None
