@@ -20,6 +20,8 @@ MAX_FUNCTION, MAX_MODULE = 60, 350  # lines that are not docstring
 ORDER = (
     "records",
     "arrays",
+    "checks",
+    "env_config",
     "config",
     "envs.*",
     "rollout",

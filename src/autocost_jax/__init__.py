@@ -10,7 +10,6 @@ from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
 from autocost_jax.config import (
     PRESETS,
     AgentConfig,
-    EnvConfig,
     SearchConfig,
     TrainConfig,
     preset,
@@ -24,6 +23,7 @@ from autocost_jax.costs import (
     total_cost,
     training_cost,
 )
+from autocost_jax.env_config import EnvConfig, env_config
 from autocost_jax.envs.env import Env, list_envs, make_env
 from autocost_jax.es import ES, Fitness, best, mutate, select, truncation_es
 from autocost_jax.evaluate import evaluate
@@ -34,6 +34,7 @@ from autocost_jax.records import (
     EnvState,
     EvalResult,
     Layout,
+    PhysicsState,
     Slot,
     TrainingCost,
     Trajectory,
@@ -56,6 +57,7 @@ __all__ = [
     "EvalResult",
     "Fitness",
     "Layout",
+    "PhysicsState",
     "SearchConfig",
     "Slot",
     "TrainConfig",
@@ -63,6 +65,7 @@ __all__ = [
     "Trajectory",
     "best",
     "cpo",
+    "env_config",
     "evaluate",
     "evolve",
     "intrinsic_cost",

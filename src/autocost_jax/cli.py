@@ -14,6 +14,7 @@ from autocost_jax.commandline import (
     parse,
     quiet,
     use_devices,
+    with_env,
 )
 
 HELP = """usage: autocost COMMAND [flags]
@@ -55,7 +56,7 @@ def _train(argv: list[str]) -> None:
         """Train agents with any training cost, several seeds at once.
 
         Attributes:
-          env: environment, such as Goal-Hazard-Point.
+          env: one of the worlds that `autocost info` lists.
           algorithms: ppo, ppo_lagrangian, cpo: one method each.
           cost: terms of the cost bank, such as "extrinsic+0.1*safety_margin_2x".
           limit: allowed training cost of an episode.
@@ -88,7 +89,8 @@ def _train(argv: list[str]) -> None:
             default_factory=TrainConfig
         )
 
-    default = Options(train=preset(flag(argv, "--preset") or "laptop").train)
+    train = preset(flag(argv, "--preset") or "laptop").train
+    default = Options(train=with_env(train, argv))
     options = parse(Options, argv, "autocost train", default=default)
     devices = use_devices(options.devices)  # before anything of JAX runs
     from autocost_jax.methods import Method, TableConfig, run_table
@@ -99,7 +101,7 @@ def _train(argv: list[str]) -> None:
     else:
         theta = _theta(options.theta)
         config = TableConfig(
-            train=_with_env(options.train, options.env),
+            train=options.train,
             methods=tuple(
                 Method(name, name, options.cost, options.limit, theta)
                 for name in options.algorithms
@@ -114,17 +116,6 @@ def _train(argv: list[str]) -> None:
         devices=devices,
         num_episodes=options.episodes,
     )
-
-
-def _with_env(train: Any, name: str) -> Any:
-    """The training configuration in the environment of a name."""
-    import dataclasses
-
-    from autocost_jax.envs.env import make_env
-
-    env = make_env(name).config
-    names = {"task": env.task, "constraint": env.constraint, "robot": env.robot}
-    return dataclasses.replace(train, env=dataclasses.replace(train.env, **names))
 
 
 def _theta(path: Path | None) -> tuple[float, ...] | None:
@@ -248,13 +239,14 @@ def _info(argv: list[str]) -> None:
         return
     from autocost_jax.config import PRESETS
     from autocost_jax.costs import BANK
-    from autocost_jax.envs.env import list_envs
+    from autocost_jax.env_config import ENVS, SUITE
     from autocost_jax.store import run_facts
 
     facts = run_facts()
     facts.pop("seed")
     facts |= {
-        "environments": list_envs(),
+        "environments": list(ENVS),
+        "safety gym suite": list(SUITE),
         "presets": {name: f"{p.env_steps:,} env steps" for name, p in PRESETS.items()},
         "cost terms": [term.name for term in BANK],
     }

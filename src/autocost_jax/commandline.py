@@ -1,6 +1,7 @@
 """What the command lines share: flags from dataclasses, devices, one-line errors."""
 
 import contextlib
+import dataclasses
 import io
 import logging
 import os
@@ -8,6 +9,9 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
+
+from autocost_jax.config import TrainConfig
+from autocost_jax.env_config import env_config
 
 T = TypeVar("T")
 BAD_INPUT = 2
@@ -46,6 +50,22 @@ def flag(argv: Sequence[str], name: str) -> str | None:
         if word.startswith(f"{name}="):
             return word.partition("=")[2]
     return None
+
+
+def with_env(train: TrainConfig, argv: Sequence[str]) -> TrainConfig:
+    """The training configuration in the world that `--env` names, if it is given.
+
+    Flags of single settings come on top of it; only the episode's length is the
+    preset's.
+
+    Raises:
+      ValueError: if there is no such world; the message lists those that exist.
+    """
+    name = flag(argv, "--env")
+    if name is None:
+        return train
+    env = dataclasses.replace(env_config(name), num_steps=train.env.num_steps)
+    return dataclasses.replace(train, env=env)
 
 
 def fail(message: str, status: int = BAD_INPUT) -> None:

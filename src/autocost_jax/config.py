@@ -1,125 +1,27 @@
-"""Frozen configuration: it shapes the program and is checked before tracing.
+"""Frozen configuration of learners and search, and the presets.
 
-`EnvConfig` keeps Safety Gym's keys letter for letter, so that a preset can be
-compared with the original's. Every default marked *ours* is a choice that neither
-the AutoCost paper nor Safety Gym settles.
+All of it shapes the program and is checked before tracing; the worlds have a module of
+their own, `env_config`. Every default marked *ours* is a choice that neither the
+AutoCost paper nor Safety Gym settles.
 """
 
 import dataclasses
-import math
-import numbers
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
+
+from autocost_jax.checks import (
+    is_finite,
+    is_integer,
+    require,
+    require_counts,
+    require_finite,
+    require_positive,
+)
+from autocost_jax.env_config import EnvConfig
 
 Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
-LIDAR_BINS = 8  # the paper's constraint lidar: the intrinsic network's input
 THETA_SIZE = 41
-
-
-def _require(ok: bool, name: str, allowed: str, got: Any) -> None:
-    if not ok:
-        raise ValueError(f"{name} must be {allowed}, got {got!r}")
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and math.isfinite(value)
-
-
-def _require_finite(config: Any, *names: str) -> None:
-    for name in names:
-        value = getattr(config, name)
-        _require(_is_finite(value), name, "finite", value)
-
-
-def _require_positive(config: Any, *names: str) -> None:
-    for name in names:
-        value = getattr(config, name)
-        _require(_is_finite(value) and value > 0, name, "finite and > 0", value)
-
-
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
-
-
-def _require_counts(config: Any, *names: str) -> None:
-    for name in names:
-        value = getattr(config, name)
-        _require(_is_integer(value) and value >= 1, name, "an integer >= 1", value)
-
-
-@dataclass(frozen=True)
-class EnvConfig:
-    """One Safety Gym world; lengths in metres, names as in Safety Gym's engine.
-
-    The default is the paper's training environment, Goal-Hazard-Point. Counts,
-    radii, extents and keepouts are ours (the paper does not state them): engine
-    defaults where Safety Gym has one, 8 hazards as in its Goal1.
-    """
-
-    task: Literal["Goal"] = "Goal"
-    constraint: Literal["Hazard"] = "Hazard"
-    robot: Literal["Point"] = "Point"
-    num_steps: int = 1000
-    frameskip_binom_n: int = 10
-    placements_extents: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
-    placements_margin: float = 0.0
-    robot_keepout: float = 0.4
-    goal_size: float = 0.3
-    goal_keepout: float = 0.4
-    hazards_num: int = 8
-    hazards_size: float = 0.3
-    hazards_keepout: float = 0.4
-    hazards_cost: float = 1.0
-    constrain_indicator: bool = False
-    lidar_num_bins: int = LIDAR_BINS
-    lidar_max_dist: float | None = None
-    lidar_exp_gain: float = 1.0
-    lidar_alias: bool = True
-    reward_distance: float = 1.0
-    reward_goal: float = 1.0
-    reward_clip: float = 10.0
-
-    def __post_init__(self) -> None:
-        for name, allowed in (
-            ("task", ("Goal",)),
-            ("constraint", ("Hazard",)),
-            ("robot", ("Point",)),
-        ):
-            value = getattr(self, name)
-            _require(value in allowed, name, f"one of {', '.join(allowed)}", value)
-        _require_counts(
-            self, "num_steps", "frameskip_binom_n", "lidar_num_bins", "hazards_num"
-        )
-        _require_finite(self, "hazards_cost", "reward_distance", "reward_goal")
-        margin = self.placements_margin
-        ok = _is_finite(margin) and margin >= 0
-        _require(ok, "placements_margin", "finite and >= 0", margin)
-        _require_positive(
-            self,
-            "goal_size",
-            "goal_keepout",
-            "robot_keepout",
-            "hazards_size",
-            "hazards_keepout",
-            "lidar_exp_gain",
-            "reward_clip",
-        )
-        if self.lidar_max_dist is not None:
-            _require_positive(self, "lidar_max_dist")
-        x0, y0, x1, y1 = self.placements_extents
-        wide = 2 * max(self.robot_keepout, self.goal_keepout, self.hazards_keepout)
-        _require(
-            wide < x1 - x0 < math.inf and wide < y1 - y0 < math.inf,
-            "placements_extents",
-            f"(xmin, ymin, xmax, ymax), finite, more than {wide} m wide and high",
-            self.placements_extents,
-        )
-
-    @property
-    def name(self) -> str:
-        """`{task}-{constraint}-{robot}`, as the paper writes it."""
-        return f"{self.task}-{self.constraint}-{self.robot}"
 
 
 @dataclass(frozen=True)
@@ -154,7 +56,7 @@ class AgentConfig:
     backtrack_ratio: float = 0.8
 
     def __post_init__(self) -> None:
-        _require_counts(
+        require_counts(
             self,
             "policy_passes",
             "policy_minibatches",
@@ -163,20 +65,20 @@ class AgentConfig:
             "cg_iterations",
             "backtrack_steps",
         )
-        _require_finite(self, "log_std_init")
-        _require(
-            all(_is_integer(size) and size >= 1 for size in self.hidden_sizes),
+        require_finite(self, "log_std_init")
+        require(
+            all(is_integer(size) and size >= 1 for size in self.hidden_sizes),
             "hidden_sizes",
             "a tuple of integers >= 1",
             self.hidden_sizes,
         )
         for name in ("gamma", "cost_gamma"):
             value = getattr(self, name)
-            _require(0 < value <= 1, name, "in (0, 1]", value)
+            require(0 < value <= 1, name, "in (0, 1]", value)
         for name in ("gae_lambda", "cost_gae_lambda"):
             value = getattr(self, name)
-            _require(0 <= value <= 1, name, "in [0, 1]", value)
-        _require_positive(
+            require(0 <= value <= 1, name, "in [0, 1]", value)
+        require_positive(
             self,
             "policy_lr",
             "value_lr",
@@ -188,7 +90,7 @@ class AgentConfig:
             "cg_damping",
         )
         ratio = self.backtrack_ratio
-        _require(0 < ratio < 1, "backtrack_ratio", "in (0, 1)", ratio)
+        require(0 < ratio < 1, "backtrack_ratio", "in (0, 1)", ratio)
 
 
 @dataclass(frozen=True)
@@ -209,24 +111,24 @@ class TrainConfig:
     chunk_epochs: int = 1
 
     def __post_init__(self) -> None:
-        _require_counts(
+        require_counts(
             self, "num_worlds", "segments_per_episode", "num_epochs", "chunk_epochs"
         )
         k, steps = self.segments_per_episode, self.env.num_steps
-        _require(
+        require(
             steps % k == 0, "segments_per_episode", f"a divisor of num_steps={steps}", k
         )
         rows = self.num_worlds * steps  # k cohorts x 1/k of an episode
         for name in ("policy_minibatches", "value_minibatches"):
             count = getattr(self.agent, name)
-            _require(
+            require(
                 rows % count == 0,
                 name,
                 f"a divisor of num_worlds x num_steps = {rows}",
                 count,
             )
         chunk = self.chunk_epochs
-        _require(
+        require(
             self.num_epochs % chunk == 0,
             "chunk_epochs",
             f"a divisor of num_epochs={self.num_epochs}",
@@ -267,24 +169,24 @@ class SearchConfig:
     selection: Selection = "paper"
 
     def __post_init__(self) -> None:
-        _require_counts(
+        require_counts(
             self, "population_size", "num_elites", "num_stages", "fitness_epochs"
         )
         size = self.population_size
-        _require(
+        require(
             self.num_elites <= size,
             "num_elites",
             f"in [1, population_size={size}]",
             self.num_elites,
         )
-        _require(
+        require(
             self.fitness_epochs <= max(1, self.train.num_epochs // 3),
             "fitness_epochs",
             f"in [1, num_epochs={self.train.num_epochs} // 3]",
             self.fitness_epochs,
         )
         known = ("ppo_lagrangian", "cpo")
-        _require(
+        require(
             len(self.algorithms) > 0
             and len(set(self.algorithms)) == len(self.algorithms)
             and all(name in known for name in self.algorithms),
@@ -292,26 +194,26 @@ class SearchConfig:
             f"distinct names out of {', '.join(known)}",
             self.algorithms,
         )
-        _require_positive(
+        require_positive(
             self, "init_std", "mutation_std", "mutation_low", "mutation_high"
         )
-        _require_finite(self, "cost_limit")
+        require_finite(self, "cost_limit")
         segments = self.train.segments_per_episode
-        _require(segments == 1, "segments_per_episode", "1 in a search", segments)
+        require(segments == 1, "segments_per_episode", "1 in a search", segments)
         low, high = self.mutation_low, self.mutation_high
-        _require(high >= low, "mutation_high", f">= mutation_low={low}", high)
+        require(high >= low, "mutation_high", f">= mutation_low={low}", high)
         tolerance = self.zero_tolerance
-        ok = _is_finite(tolerance) and tolerance >= 0
-        _require(ok, "zero_tolerance", "finite and >= 0", tolerance)
+        ok = is_finite(tolerance) and tolerance >= 0
+        require(ok, "zero_tolerance", "finite and >= 0", tolerance)
         selections = ("paper", "random")
-        _require(
+        require(
             self.selection in selections,
             "selection",
             f"one of {', '.join(selections)}",
             self.selection,
         )
-        ok = _is_integer(self.seed) and 0 <= self.seed < 2**32
-        _require(ok, "seed", "an integer in [0, 2**32)", self.seed)
+        ok = is_integer(self.seed) and 0 <= self.seed < 2**32
+        require(ok, "seed", "an integer in [0, 2**32)", self.seed)
 
     @property
     def env_steps(self) -> int:

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.arrays import load_arrays
-from autocost_jax.config import LIDAR_BINS, THETA_SIZE
+from autocost_jax.config import THETA_SIZE
+from autocost_jax.env_config import LIDAR_BINS
 from autocost_jax.records import CostInputs, TrainingCost
 
 HIDDEN = 4  # the paper's hidden layer: 8 * 4 + 4 + 4 + 1 = 41 parameters

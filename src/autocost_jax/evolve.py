@@ -21,9 +21,9 @@ from autocost_jax.commandline import (
     parse,
     quiet,
     use_devices,
+    with_env,
 )
 from autocost_jax.config import PRESETS, SearchConfig, preset
-from autocost_jax.envs.env import list_envs, make_env
 from autocost_jax.evolution import evolve, search
 
 __all__ = ["evolve", "main", "search"]
@@ -42,13 +42,6 @@ def _main(argv: list[str]) -> None:
     options = parse(_options_type(), argv, PROG, default=defaults, description=__doc__)
     devices = use_devices(options.devices)  # before anything of JAX runs
     config = options.search
-    if options.env is not None:
-        env = make_env(options.env).config  # unknown: lists the valid ones
-        names = {"task": env.task, "constraint": env.constraint, "robot": env.robot}
-        env = dataclasses.replace(config.train.env, **names)
-        config = dataclasses.replace(
-            config, train=dataclasses.replace(config.train, env=env)
-        )
     from autocost_jax.run import describe, run_search
 
     path = options.out or Path("runs") / f"{options.preset}-seed{config.seed}"
@@ -79,7 +72,7 @@ def _options_type() -> Any:
             paper's hyper-parameters; smoke: a test of the installation. The other
             flags default to the preset's values.
           config: run directory whose config.yaml replaces the preset's values.
-          env: environment, such as Goal-Hazard-Point.
+          env: one of the worlds that `autocost info` lists.
           out: run directory; default runs/PRESET-seedN.
           resume: continue the run in `out` from its newest checkpoint.
           overwrite: start over in a directory that already holds a run.
@@ -118,9 +111,7 @@ def _defaults(argv: list[str]) -> Any:
         from autocost_jax.store import read_config
 
         config, _ = read_config(Path(source))
-    env = flag(argv, "--env")
-    if env is not None and env not in list_envs():
-        make_env(env)
+    config = dataclasses.replace(config, train=with_env(config.train, argv))
     return _options_type()(preset=name, search=config)
 
 

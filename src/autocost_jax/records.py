@@ -4,7 +4,8 @@ Axes, used in every docstring of the package:
 
     A  algorithms        P  slots (one agent each)   N  worlds of a slot
     T  steps             O  observation              U  action
-    H  hazards           Q  pillars                  B  lidar bins (8)
+    H  hazards           Q  pillars                  V  vases
+    B  lidar bins (8)    M  objects of a list
     D  parameters of the intrinsic cost (41)         K  terms of the cost bank
 
 Lengths are metres, angles radians, times seconds.
@@ -13,6 +14,7 @@ Lengths are metres, angles radians, times seconds.
 from typing import Any
 
 import jax
+import numpy as np
 from flax import struct
 
 Key = jax.Array
@@ -30,6 +32,8 @@ class Layout(struct.PyTreeNode):
       pillars: [Q, 2] pillar centres.
       box_xy: [2] box centre; zeros where the task has no box.
       box_yaw: [] heading of the box; zero where the task has no box.
+      vases: [V, 2] vase centres; only Safety Gym's own suite has vases.
+      vases_yaw: [V] headings of the vases.
     """
 
     robot_xy: jax.Array
@@ -39,6 +43,58 @@ class Layout(struct.PyTreeNode):
     pillars: jax.Array
     box_xy: jax.Array
     box_yaw: jax.Array
+    vases: jax.Array = struct.field(default_factory=lambda: np.zeros((0, 2), "f4"))
+    vases_yaw: jax.Array = struct.field(default_factory=lambda: np.zeros(0, "f4"))
+
+
+class Bodies(struct.PyTreeNode):
+    """Where the movable bodies are and what they touch, read from the physics.
+
+    Attributes:
+      robot: [3] origin of the robot, world frame.
+      rotation: [3, 3] robot body to world.
+      box: [3] centre of the box; zeros where the task has no box.
+      box_yaw: [] heading of the box.
+      vases: [V, 3] vase centres.
+      vases_yaw: [V] headings of the vases.
+      vases_speed: [V] speeds of the vases' centres, m/s.
+      pillar_contacts: [] int32 contact points between robot and pillars.
+      vase_contacts: [] int32 contact points between robot and vases.
+    """
+
+    robot: jax.Array
+    rotation: jax.Array
+    box: jax.Array
+    box_yaw: jax.Array
+    vases: jax.Array
+    vases_yaw: jax.Array
+    vases_speed: jax.Array
+    pillar_contacts: jax.Array
+    vase_contacts: jax.Array
+
+
+class PhysicsState(struct.PyTreeNode):
+    """The physics of one world between two control steps.
+
+    A state is set by replacing `qpos` and `qvel`; the rest follows in the next step.
+
+    Attributes:
+      qpos: [nq] robot, box (7), vases (7 each); see `mj_model`.
+      qvel: [nv] likewise, 6 for each free body.
+      ctrl: [U] the last action, clipped.
+      qacc_warmstart: [nv] where the constraint solver starts.
+      sensordata: raw sensor readings in the order of the robot's XML.
+      time: [] seconds since the reset.
+      bodies: positions and contacts of this very state.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    ctrl: jax.Array
+    qacc_warmstart: jax.Array
+    sensordata: jax.Array
+    time: jax.Array
+    bodies: Bodies
 
 
 class CostInputs(struct.PyTreeNode):
@@ -49,7 +105,7 @@ class CostInputs(struct.PyTreeNode):
       constraint_lidar: [..., B] the 8-bin lidar of the hazards or pillars, in [0, 1].
       distance: [...] planar distance, robot origin to the closest constraint centre.
       previous_distance: [...] the same one step earlier (at reset: `distance`).
-      radius: [...] radius of a constraint object.
+      radius: [...] radius of that closest object.
     """
 
     cost: jax.Array
@@ -63,7 +119,7 @@ class EnvState(struct.PyTreeNode):
     """One world between two steps.
 
     Attributes:
-      data: `mjx.Data`, the physics; `step` reads the physical state from here alone.
+      data: the physics, a `PhysicsState`; `step` reads the physical state here alone.
       layout: where things stand now; `goal_xy` moves when a goal is met.
       obs: [O] observation.
       reward: [] reward of the last step.

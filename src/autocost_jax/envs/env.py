@@ -9,17 +9,22 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-from mujoco import mjx
+import numpy as np
 
-from autocost_jax.config import LIDAR_BINS, EnvConfig
+from autocost_jax.env_config import ENVS, LIDAR_BINS, EnvConfig, env_config
 from autocost_jax.envs import layout as layouts
-from autocost_jax.envs.constraints import Constraint, distances_to, hazard_constraint
+from autocost_jax.envs.constraints import Constraint, distances_to, make_constraint
 from autocost_jax.envs.sensors import flatten, lidar, slices
-from autocost_jax.envs.tasks import Task, goal_task
+from autocost_jax.envs.tasks import Task, make_task
 from autocost_jax.envs.world import World, make_world
-from autocost_jax.records import CostInputs, EnvState, Key, Layout
-
-_CONFIGS = {config.name: config for config in (EnvConfig(),)}
+from autocost_jax.records import (
+    Bodies,
+    CostInputs,
+    EnvState,
+    Key,
+    Layout,
+    PhysicsState,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +42,7 @@ class Env:
       dt: seconds of a step.
       obs_slices: name of each part of the observation -> its slice.
       config: the configuration it was made from.
-      mj_model: the robot's `mujoco.MjModel`; None where there is none.
+      mj_model: the `mujoco.MjModel` that is stepped; None where there is none.
     """
 
     reset: Callable[[Key], EnvState]
@@ -60,36 +65,38 @@ class _Parts(NamedTuple):
     arena: layouts.Arena
     task: Task
     constraint: Constraint
+    observed: tuple[str, ...]
 
 
 def list_envs() -> list[str]:
-    """Names that `make_env` knows."""
-    return list(_CONFIGS)
+    """Names of the twelve worlds; `make_env` also knows Safety Gym's own suite."""
+    return list(ENVS)
 
 
 def make_env(name_or_config: str | EnvConfig) -> Env:
     """The environment of a name, or of a configuration.
 
+    Args:
+      name_or_config: such as "Push-Pillar-Car"; or of Safety Gym's own suite, such as
+        "CarPush2"; or an `EnvConfig`.
+
     Raises:
       ValueError: if the name is unknown, or if the configuration's objects fail to
         fit in more than 5 % of 256 trial layouts.
     """
-    if isinstance(name_or_config, EnvConfig):
-        config = name_or_config
-    elif name_or_config in _CONFIGS:
-        config = _CONFIGS[name_or_config]
-    else:
-        known = ", ".join(list_envs())
-        raise ValueError(f"unknown environment {name_or_config!r}; known: {known}")
+    config = name_or_config
+    if isinstance(config, str):
+        config = env_config(config)
     parts = _Parts(
         config=config,
         arena=layouts.make_arena(config),
         world=make_world(config),
-        task=goal_task(config),
-        constraint=hazard_constraint(config),
+        task=make_task(config),
+        constraint=make_constraint(config),
+        observed=_observed_kinds(config),
     )
     world = parts.world
-    lidar_names = (*parts.task.lidars, parts.constraint.lidar_name)
+    lidar_names = (*parts.task.lidars, *(f"{kind}_lidar" for kind in parts.observed))
     lidar_sizes = dict.fromkeys(lidar_names, config.lidar_num_bins)
     obs_slices = slices({**world.sensor_sizes, **lidar_sizes})
     return Env(
@@ -106,6 +113,12 @@ def make_env(name_or_config: str | EnvConfig) -> Env:
     )
 
 
+def _observed_kinds(config: EnvConfig) -> tuple[str, ...]:
+    """The fields of a `Layout` that a lidar of their own sees."""
+    kinds = ("hazards", "vases", "pillars")
+    return tuple(kind for kind in kinds if getattr(config, f"observe_{kind}"))
+
+
 def _reset(parts: _Parts, key: Key) -> EnvState:
     key_layout, key_state = jax.random.split(key)
     dtype = parts.world.dtype
@@ -118,18 +131,20 @@ def _reset_to(parts: _Parts, layout: Layout, key: Key) -> EnvState:
     """The first state of an episode in a given layout.
 
     Raises:
-      AssertionError: while tracing, if the layout has another number of hazards than
+      AssertionError: while tracing, if the layout has another number of objects than
         the configuration.
     """
-    chex.assert_shape(layout.hazards, (parts.config.hazards_num, 2))
-    chex.assert_shape(layout.pillars, (0, 2))
+    config = parts.config
+    for kind in ("hazards", "vases", "pillars"):
+        chex.assert_shape(getattr(layout, kind), (getattr(config, f"{kind}_num"), 2))
+    chex.assert_shape(layout.vases_yaw, (config.vases_num,))
     dtype = parts.world.dtype
     layout = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), layout)
     data = parts.world.place(layout)
-    layout = _update_layout(parts, layout, data)
+    layout = _update_layout(parts, layout, data.bodies)
     zero = jnp.zeros((), dtype)
     obs, constraint_lidar = _observe(parts, layout, data)
-    distance = distances_to(parts.constraint, layout).min()
+    distance, radius = _closest(parts.constraint, layout)
     state = EnvState(
         data=data,
         layout=layout,
@@ -139,13 +154,13 @@ def _reset_to(parts: _Parts, layout: Layout, key: Key) -> EnvState:
         done=jnp.zeros((), bool),
         failed=jnp.zeros((), bool),
         age=jnp.zeros((), jnp.int32),
-        task_distances=parts.task.distances(layout),
+        task_distances=parts.task.distances(layout, data.bodies),
         cost_inputs=CostInputs(
             cost=zero,
             constraint_lidar=constraint_lidar,
             distance=distance,
             previous_distance=distance,
-            radius=jnp.full((), parts.constraint.radius, dtype),
+            radius=radius,
         ),
         metrics={
             "goals_met": jnp.zeros((), jnp.int32),
@@ -175,16 +190,16 @@ def _step(parts: _Parts, state: EnvState, action: jax.Array) -> EnvState:
     """
     config, task, constraint = parts.config, parts.task, parts.constraint
     chex.assert_shape(action, (parts.world.action_size,))
-    data = parts.world.control_step(state.data, action)
-    layout = _update_layout(parts, state.layout, data)
+    data = parts.world.control_step(state.data, state.layout, action)
+    layout = _update_layout(parts, state.layout, data.bodies)
 
     # Judged before the goal moves.
-    current = task.distances(layout)
+    current = task.distances(layout, data.bodies)
     is_met = task.is_met(current)
     reward = task.reward(state.task_distances, current)
     reward = reward + jnp.where(is_met, config.reward_goal, 0.0)
-    distances = distances_to(constraint, layout)
-    cost = constraint.cost(distances)
+    cost = constraint.cost(distances_to(constraint, layout), data.bodies)
+    distance, radius = _closest(constraint, layout)
 
     # Drawn whether or not it is needed: under vmap a condition would run both ways.
     age = state.age + 1
@@ -194,7 +209,7 @@ def _step(parts: _Parts, state: EnvState, action: jax.Array) -> EnvState:
     layout = layout.replace(goal_xy=goal_xy)
 
     obs, constraint_lidar = _observe(parts, layout, data)
-    travelled = layout.robot_xy - parts.world.robot_xy(state.data)
+    travelled = layout.robot_xy - state.data.qpos[:2]
     counters = state.metrics
     new_state = state.replace(
         data=data,
@@ -204,13 +219,13 @@ def _step(parts: _Parts, state: EnvState, action: jax.Array) -> EnvState:
         cost=cost,
         done=age == config.num_steps,
         age=age,
-        task_distances=task.distances(layout),
+        task_distances=task.distances(layout, data.bodies),
         cost_inputs=CostInputs(
             cost=cost,
             constraint_lidar=constraint_lidar,
-            distance=distances.min(),
+            distance=distance,
             previous_distance=state.cost_inputs.distance,
-            radius=state.cost_inputs.radius,
+            radius=radius,
         ),
         metrics={
             "goals_met": counters["goals_met"] + is_met,
@@ -222,19 +237,37 @@ def _step(parts: _Parts, state: EnvState, action: jax.Array) -> EnvState:
     return _silence(state, new_state, state.failed | ~_is_finite(new_state))
 
 
-def _update_layout(parts: _Parts, layout: Layout, data: mjx.Data) -> Layout:
-    """The layout with the robot where the physics has it now."""
-    position, rotation = parts.world.robot_pose(data)
-    yaw = jnp.arctan2(rotation[1, 0], rotation[0, 0])
-    return layout.replace(robot_xy=position[:2], robot_yaw=yaw)
+def _update_layout(parts: _Parts, layout: Layout, bodies: Bodies) -> Layout:
+    """The layout with robot, box and vases where the physics has them now."""
+    rotation = bodies.rotation
+    layout = layout.replace(
+        robot_xy=bodies.robot[:2],
+        robot_yaw=jnp.arctan2(rotation[1, 0], rotation[0, 0]),
+    )
+    if parts.config.task == "Push":
+        layout = layout.replace(box_xy=bodies.box[:2], box_yaw=bodies.box_yaw)
+    if parts.config.vases_num:
+        vases = bodies.vases[:, :2]
+        layout = layout.replace(vases=vases, vases_yaw=bodies.vases_yaw)
+    return layout
+
+
+def _closest(constraint: Constraint, layout: Layout) -> tuple[jax.Array, jax.Array]:
+    """Distance [] to the closest constrained object's centre, and its radius []."""
+    distances = distances_to(constraint, layout)
+    radii = jnp.asarray(constraint.radii, distances.dtype)
+    if len(np.unique(constraint.radii)) == 1:
+        return distances.min(), radii[0]
+    index = distances.argmin()
+    return distances[index], radii[index]
 
 
 def _observe(
-    parts: _Parts, layout: Layout, data: mjx.Data
+    parts: _Parts, layout: Layout, data: PhysicsState
 ) -> tuple[jax.Array, jax.Array]:
-    """The flat observation [O] and the 8-bin lidar [B] of the constraint's objects."""
+    """The flat observation [O] and the 8-bin lidar [B] of the constrained objects."""
     config, constraint = parts.config, parts.constraint
-    position, rotation = parts.world.robot_pose(data)
+    position, rotation = data.bodies.robot, data.bodies.rotation
     see = functools.partial(
         lidar,
         position=position,
@@ -244,19 +277,12 @@ def _observe(
         exp_gain=config.lidar_exp_gain,
         alias=config.lidar_alias,
     )
-    objects = constraint.objects(layout)
-    seen = see(objects)
     obs = {name: see(targets(layout)) for name, targets in parts.task.lidars.items()}
-    obs |= {constraint.lidar_name: seen, **parts.world.sensors(data)}
-    # What the intrinsic cost reads does not depend on what the robot observes.
-    observed = (
-        config.lidar_num_bins,
-        config.lidar_max_dist,
-        config.lidar_exp_gain,
-        config.lidar_alias,
-    )
-    if observed != (LIDAR_BINS, None, 1.0, True):
-        seen = lidar(objects, position, rotation, num_bins=LIDAR_BINS)
+    obs |= {f"{kind}_lidar": see(getattr(layout, kind)) for kind in parts.observed}
+    obs |= parts.world.sensors(data)
+    # What the intrinsic cost reads does not depend on what the robot observes; where
+    # the two are the same the compiler computes them once.
+    seen = lidar(constraint.objects(layout), position, rotation, num_bins=LIDAR_BINS)
     return flatten(obs), seen
 
 

@@ -14,30 +14,40 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.config import EnvConfig
+from autocost_jax.env_config import EnvConfig
 from autocost_jax.records import Key, Layout
 
 NUM_CANDIDATES = 128  # draws for one object; Safety Gym makes up to 100
 NUM_RESTARTS = 4  # whole layouts tried side by side; one fails 0.3-0.8 % of the time
 HOST_LAYOUTS = 256
 MAX_HOST_FAILURES = 0.05
-ROBOT, GOAL, HAZARDS = 0, 1, 2  # first row of each kind of object
+ROBOT, GOAL = 0, 1  # their rows in placement order
 
 
 class Arena(NamedTuple):
-    """Where objects may stand, in placement order: robot, goal, hazards.
+    """Where objects may stand, in placement order.
+
+    Robot, goal, box (Push only), hazards, vases, pillars: Safety Gym's order.
 
     Attributes:
       keepout: [M] radius each object keeps free around itself.
       low: [M, 2] lower corner of the extents shrunk by the object's own keepout.
       size: [M, 2] width and height of the shrunk extents.
       margin: extra gap between two keepouts.
+      box: row of the box, as a slice that is empty where there is none.
+      hazards: rows of the hazards.
+      vases: rows of the vases.
+      pillars: rows of the pillars.
     """
 
     keepout: np.ndarray
     low: np.ndarray
     size: np.ndarray
     margin: float
+    box: slice
+    hazards: slice
+    vases: slice
+    pillars: slice
 
 
 def make_arena(config: EnvConfig) -> Arena:
@@ -46,19 +56,20 @@ def make_arena(config: EnvConfig) -> Arena:
     Raises:
       ValueError: if more than 5 % of 256 trial layouts cannot be placed.
     """
-    hazards = [config.hazards_keepout] * config.hazards_num
-    keepout = np.array([config.robot_keepout, config.goal_keepout, *hazards])
+    keepout = np.array(config.keepouts)
     corners = np.asarray(config.placements_extents)
     low = corners[None, :2] + keepout[:, None]
     size = corners[None, 2:] - keepout[:, None] - low
-    arena = Arena(keepout, low, size, config.placements_margin)
+    nums = (config.task == "Push", config.hazards_num, config.vases_num)
+    ends = [int(end) for end in 2 + np.cumsum((*nums, config.pillars_num))]
+    rows = map(slice, [2, *ends], ends)
+    arena = Arena(keepout, low, size, config.placements_margin, *rows)
     share = host_failure_share(arena)
     if share > MAX_HOST_FAILURES:
         raise ValueError(
             f"the objects of {config.name} do not fit: {share:.0%} of {HOST_LAYOUTS} "
             f"trial layouts failed, at most {MAX_HOST_FAILURES:.0%} may; enlarge "
-            "placements_extents or lower hazards_num, hazards_keepout, goal_keepout "
-            "or robot_keepout"
+            "placements_extents or lower the numbers or keepouts of the objects"
         )
     return arena
 
@@ -200,19 +211,24 @@ def sample_layout(arena: Arena, key: Key, dtype: Any) -> tuple[Layout, jax.Array
       the layout, and `failed` []: True if every one of four attempts failed (the
       layout then breaks a keepout).
     """
-    key_draws, key_yaw = jax.random.split(key)
+    key_draws, key_yaw, key_yaws = jax.random.split(key, 3)
     shape = (NUM_RESTARTS, len(arena.keepout) + 1, NUM_CANDIDATES)
     draws = draw_points(key_draws, shape, dtype)
     placed, success = jax.vmap(functools.partial(place_all, arena))(draws)
     xy = placed[jnp.argmax(success)]
+    vases = xy[arena.vases]
+    yaws = jax.random.uniform(key_yaws, (1 + len(vases),), dtype, 0.0, 2 * np.pi)
+    has_box = arena.box.stop > arena.box.start
     layout = Layout(
         robot_xy=xy[ROBOT],
         robot_yaw=jax.random.uniform(key_yaw, (), dtype, 0.0, 2 * np.pi),
         goal_xy=xy[GOAL],
-        hazards=xy[HAZARDS:],
-        pillars=jnp.zeros((0, 2), dtype),
-        box_xy=jnp.zeros(2, dtype),
-        box_yaw=jnp.zeros((), dtype),
+        hazards=xy[arena.hazards],
+        pillars=xy[arena.pillars],
+        box_xy=xy[arena.box][0] if has_box else jnp.zeros(2, dtype),
+        box_yaw=yaws[0] if has_box else jnp.zeros((), dtype),
+        vases=vases,
+        vases_yaw=yaws[1:],
     )
     return layout, ~success.any()
 
@@ -234,7 +250,10 @@ def move_goal(arena: Arena, layout: Layout, key: Key) -> tuple[jax.Array, jax.Ar
     instead of the end of the episode.
     """
     dtype = layout.goal_xy.dtype
-    others = jnp.concatenate([layout.robot_xy[None], layout.hazards])
+    box = layout.box_xy[None][: arena.box.stop - arena.box.start]
+    others = jnp.concatenate(
+        [layout.robot_xy[None], box, layout.hazards, layout.vases, layout.pillars]
+    )
     keepout = jnp.asarray(np.delete(arena.keepout, GOAL), dtype)
     draws = draw_points(key, (NUM_CANDIDATES,), dtype)
     low, size = (jnp.asarray(part[GOAL], dtype) for part in (arena.low, arena.size))

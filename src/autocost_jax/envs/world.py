@@ -1,126 +1,269 @@
-"""The physics: a robot in MuJoCo MJX, one control period at a time.
+"""The physics: a scene in MuJoCo MJX, one control period at a time.
 
 Names are resolved to integers once, when the world is made; what remains are pure
-functions of `mjx.Data`.
+functions of `PhysicsState`.
 """
 
+import functools
 from collections.abc import Callable, Mapping
-from importlib import resources
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco as untyped_mujoco
+import numpy as np
 from mujoco import mjx
 
-from autocost_jax.config import EnvConfig
-from autocost_jax.records import Layout
+from autocost_jax.env_config import EnvConfig
+from autocost_jax.envs.models import PhysicsModel, mujoco, physics_model
+from autocost_jax.records import Bodies, Layout, PhysicsState
 
-mujoco: Any = untyped_mujoco  # its compiled names have no stubs
-SENSORS = ("accelerometer", "gyro", "magnetometer", "velocimeter")
+Moving = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, qacc_warmstart
 
 
 class World(NamedTuple):
-    """The physics of one robot, as pure functions of its data.
+    """The physics of one scene, as pure functions of its state.
 
     Attributes:
-      mj_model: the `mujoco.MjModel`; for rendering and for references in C.
-      rest: data at the origin, at rest; a template.
-      place: layout -> data at rest there, sensors evaluated.
-      control_step: (data, action [U]) -> data one control period later.
-      robot_xy: data -> [2] robot origin, from `qpos` alone.
-      robot_pose: data -> position [3] and rotation [3, 3] of the robot's body.
-      sensors: data -> name and reading of each sensor.
-      sensor_sizes: name of each sensor -> how many numbers it reads.
+      mj_model: the `mujoco.MjModel` that is stepped.
+      place: layout -> state at rest there, sensors evaluated.
+      control_step: (state, layout, action [U]) -> state one control period later; of
+        the layout only the pillars are read.
+      sensors: state -> name and reading of each sensor, as observed.
+      sensor_sizes: name of each sensor -> how many numbers it is observed as.
       action_size: U.
       dt: seconds of a control period.
       dtype: floating type of the state.
     """
 
     mj_model: Any
-    rest: mjx.Data
-    place: Callable[[Layout], mjx.Data]
-    control_step: Callable[[mjx.Data, jax.Array], mjx.Data]
-    robot_xy: Callable[[mjx.Data], jax.Array]
-    robot_pose: Callable[[mjx.Data], tuple[jax.Array, jax.Array]]
-    sensors: Callable[[mjx.Data], dict[str, jax.Array]]
+    place: Callable[[Layout], PhysicsState]
+    control_step: Callable[[PhysicsState, Layout, jax.Array], PhysicsState]
+    sensors: Callable[[PhysicsState], dict[str, jax.Array]]
     sensor_sizes: Mapping[str, int]
     action_size: int
     dt: float
     dtype: Any
 
 
-def load_spec(robot: str) -> Any:
-    """The `mujoco.MjSpec` of a robot, alone in empty space."""
-    file = resources.files("autocost_jax.envs") / "xmls" / f"{robot.lower()}.xml"
-    return mujoco.MjSpec.from_string(file.read_text(encoding="utf-8"))
+class _Scene(NamedTuple):
+    """A model on the device, and where its parts are in the arrays."""
+
+    physics: PhysicsModel
+    model: mjx.Model
+    rest: mjx.Data
+    box: int | None
+    vases: tuple[int, ...]
 
 
 def make_world(config: EnvConfig) -> World:
-    """The MJX world of a configuration.
-
-    The Point touches nothing: the floor meets its sphere at distance exactly 0,
-    which MuJoCo does not count as a contact, and hazards are not solid. Contacts and
-    constraints are therefore switched off, which changes no number.
-    """
-    spec = load_spec(config.robot)
-    spec.option.disableflags |= int(
-        mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    )
-    # The sparse factorisation is plain arithmetic; the dense one calls LAPACK for every
-    # world, which took about 10 % more CPU time.
-    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    mj_model = spec.compile()
+    """The MJX world of a configuration."""
+    physics = physics_model(config)
+    mj_model = physics.mj_model
     model = mjx.put_model(mj_model, impl="jax")
     rest = mjx.make_data(mj_model, impl="jax")
     model, rest = _fill_tendons(model, rest)
-    body = mj_model.body("robot").id
+    scene = _Scene(
+        physics=physics,
+        model=model,
+        rest=rest,
+        box=mj_model.body("box").id if config.task == "Push" else None,
+        vases=tuple(mj_model.body(f"vase{i}").id for i in range(config.vases_num)),
+    )
     num_substeps = config.frameskip_binom_n
-    sensor_slices = {
-        name: slice(int(sensor.adr[0]), int(sensor.adr[0] + sensor.dim[0]))
-        for name in SENSORS
-        for sensor in (mj_model.sensor(name),)
-    }
+    substep = _contact_substep if physics.has_contacts else _free_substep
 
-    def place(layout: Layout) -> mjx.Data:
-        qpos = jnp.append(layout.robot_xy, layout.robot_yaw)
-        return _refresh(model, rest.replace(qpos=qpos.astype(rest.qpos.dtype)))
+    def place(layout: Layout) -> PhysicsState:
+        qpos = _rest_qpos(scene, layout)
+        moving = (qpos, jnp.zeros_like(rest.qvel), jnp.zeros_like(rest.qvel))
+        start = rest.replace(mocap_pos=_mocap_positions(scene, layout, qpos))
+        return _observe(scene, start, moving, jnp.zeros((), qpos.dtype))
 
-    def control_step(data: mjx.Data, action: jax.Array) -> mjx.Data:
+    def control_step(
+        state: PhysicsState, layout: Layout, action: jax.Array
+    ) -> PhysicsState:
         low, high = model.actuator_ctrlrange.T
         ctrl = jnp.clip(action.astype(rest.ctrl.dtype), low, high)
+        mocap_pos = _mocap_positions(scene, layout, state.qpos)
+        start = rest.replace(ctrl=ctrl, mocap_pos=mocap_pos)
 
-        def substep(_, moving):
-            return _substep(model, rest, ctrl, *moving)
+        def body(_, moving: Moving) -> Moving:
+            return substep(model, start, moving)
 
-        moving = (data.qpos, data.qvel)
-        qpos, qvel = jax.lax.fori_loop(0, num_substeps, substep, moving)
-        time = data.time + num_substeps * model.opt.timestep
-        state = rest.replace(qpos=qpos, qvel=qvel, ctrl=ctrl, time=time)
-        return _refresh(model, state)
+        moving = (state.qpos, state.qvel, state.qacc_warmstart)
+        moving = jax.lax.fori_loop(0, num_substeps, body, moving)
+        time = state.time + num_substeps * model.opt.timestep
+        return _observe(scene, start, moving, time)
 
-    def robot_xy(data: mjx.Data) -> jax.Array:
-        return data.qpos[:2]
+    readings = {
+        mj_model.sensor(i).name: _reading(mj_model, i) for i in range(mj_model.nsensor)
+    }
 
-    def robot_pose(data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-        return data.xpos[body], data.xmat[body]
+    def sensors(state: PhysicsState) -> dict[str, jax.Array]:
+        return {name: read(state.sensordata) for name, read in readings.items()}
 
-    def sensors(data: mjx.Data) -> dict[str, jax.Array]:
-        return {name: data.sensordata[at] for name, at in sensor_slices.items()}
-
+    zeros = np.zeros(mj_model.nsensordata)
+    sizes = {
+        name: jax.eval_shape(read, zeros).size for name, read in readings.items()
+    }
     return World(
         mj_model=mj_model,
-        rest=rest,
         place=place,
         control_step=control_step,
-        robot_xy=robot_xy,
-        robot_pose=robot_pose,
         sensors=sensors,
-        sensor_sizes={name: at.stop - at.start for name, at in sensor_slices.items()},
+        sensor_sizes=sizes,
         action_size=int(mj_model.nu),
         dt=num_substeps * float(mj_model.opt.timestep),
         dtype=rest.qpos.dtype,
     )
+
+
+def _reading(mj_model: Any, index: int) -> Callable[[jax.Array], jax.Array]:
+    """How one sensor is observed, as a function of all raw readings.
+
+    A ball joint's quaternion as its rotation matrix (row by row), an angle as sine and
+    cosine, everything else as it is.
+
+    Source: openai/safety-gym engine.py, build_observation_space and obs.
+    """
+    start = int(mj_model.sensor_adr[index])
+    end = start + int(mj_model.sensor_dim[index])
+    kind = mj_model.sensor_type[index]
+
+    def read(sensordata: jax.Array) -> jax.Array:
+        values = sensordata[start:end]
+        if kind == mujoco.mjtSensor.mjSENS_BALLQUAT:
+            return _rotation(values).ravel()
+        if kind == mujoco.mjtSensor.mjSENS_JOINTPOS:
+            return jnp.concatenate([jnp.sin(values), jnp.cos(values)])
+        return jnp.asarray(values)
+
+    return read
+
+
+def _rotation(quaternion: jax.Array) -> jax.Array:
+    """[3, 3] rotation matrix of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _rest_qpos(scene: _Scene, layout: Layout) -> jax.Array:
+    """Everything at rest in its place; heights as in the model."""
+    mj_model = scene.physics.mj_model
+    qpos = scene.rest.qpos
+
+    def put(qpos: jax.Array, start: int, xy: jax.Array, yaw: jax.Array) -> jax.Array:
+        qpos = qpos.at[start : start + 2].set(xy.astype(qpos.dtype))
+        if mj_model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE and start == 0:
+            return qpos.at[2].set(yaw.astype(qpos.dtype))  # the Point: x, y, heading
+        turn = jnp.stack([jnp.cos(yaw / 2), 0 * yaw, 0 * yaw, jnp.sin(yaw / 2)])
+        return qpos.at[start + 3 : start + 7].set(turn.astype(qpos.dtype))
+
+    qpos = put(qpos, 0, layout.robot_xy, layout.robot_yaw)
+    if scene.box is not None:
+        qpos = put(qpos, _qpos_start(scene, scene.box), layout.box_xy, layout.box_yaw)
+    for i, vase in enumerate(scene.vases):
+        start = _qpos_start(scene, vase)
+        qpos = put(qpos, start, layout.vases[i], layout.vases_yaw[i])
+    return qpos
+
+
+def _qpos_start(scene: _Scene, body: int) -> int:
+    mj_model = scene.physics.mj_model
+    return int(mj_model.jnt_qposadr[mj_model.body_jntadr[body]])
+
+
+def _mocap_positions(scene: _Scene, layout: Layout, qpos: jax.Array) -> jax.Array:
+    """[nmocap, 3] the pillars that can be touched: those nearest to robot and box."""
+    mocap_pos = scene.rest.mocap_pos
+    targets = [(scene.physics.robot_pillars, qpos[:2])]
+    if scene.box is not None:
+        start = _qpos_start(scene, scene.box)
+        targets.append((scene.physics.box_pillars, qpos[start : start + 2]))
+    for ids, xy in targets:
+        if not ids:
+            continue
+        near = layout.pillars
+        if len(ids) < len(near):
+            distance = ((near - xy) ** 2).sum(-1)
+            near = near[jax.lax.top_k(-distance, len(ids))[1]]
+        mocap_pos = mocap_pos.at[np.array(ids), :2].set(near.astype(qpos.dtype))
+    return mocap_pos
+
+
+def _observe(
+    scene: _Scene, start: mjx.Data, moving: Moving, time: jax.Array
+) -> PhysicsState:
+    """The state that `moving` is, its sensors and contacts evaluated.
+
+    `mjx.forward` skips the accelerometer where a model has no constraint at all, so
+    that stage is called here.
+    """
+    model = scene.model
+    qpos, qvel, warmstart = moving
+    data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+    data = mjx.forward(model, data)
+    if not scene.physics.has_contacts:
+        data = mjx.sensor_acc(model, data)
+    return PhysicsState(
+        qpos=qpos,
+        qvel=qvel,
+        ctrl=start.ctrl,
+        qacc_warmstart=data.qacc_warmstart,
+        sensordata=data.sensordata,
+        time=time,
+        bodies=_bodies(scene, data),
+    )
+
+
+def _bodies(scene: _Scene, data: mjx.Data) -> Bodies:
+    """Where the movable bodies of `data` are and what touches what."""
+    mj_model = scene.physics.mj_model
+    dtype = data.qpos.dtype
+    robot = mj_model.body("robot").id
+    box, vases = scene.box, np.array(scene.vases, int)
+    velocity = [
+        data.qvel[start : start + 3]
+        for start in mj_model.jnt_dofadr[mj_model.body_jntadr[vases]]
+    ]
+    speeds = [jnp.sqrt((part**2).sum()) for part in velocity]
+    count = functools.partial(_count_contacts, scene, data)
+    return Bodies(
+        robot=data.xpos[robot],
+        rotation=data.xmat[robot],
+        box=jnp.zeros(3, dtype) if box is None else data.xpos[box],
+        box_yaw=jnp.zeros((), dtype) if box is None else _yaw(data.xmat[box]),
+        vases=data.xpos[vases],
+        vases_yaw=_yaw(data.xmat[vases]),
+        vases_speed=jnp.stack(speeds) if speeds else jnp.zeros(0, dtype),
+        pillar_contacts=count(scene.physics.pillar_geoms),
+        vase_contacts=count(scene.physics.vase_geoms),
+    )
+
+
+def _yaw(rotation: jax.Array) -> jax.Array:
+    """Heading of a rotation [..., 3, 3], counter-clockwise from +x."""
+    return jnp.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])
+
+
+def _count_contacts(scene: _Scene, data: mjx.Data, geoms: np.ndarray) -> jax.Array:
+    """[] how many contact points the robot has with certain geoms.
+
+    As in MuJoCo, a contact is listed at a distance of at most 0. When leaning on a
+    pillar the depth is only about 1e-4 m, so no positive depth may be asked for.
+    """
+    if not geoms.any():
+        return jnp.zeros((), jnp.int32)
+    impl: Any = data._impl
+    contact = impl.contact
+    robot = jnp.asarray(scene.physics.robot_geoms)[contact.geom]
+    other = jnp.asarray(geoms)[contact.geom]
+    is_pair = (robot[:, 0] & other[:, 1]) | (robot[:, 1] & other[:, 0])
+    return (is_pair & (contact.dist <= 0)).sum(dtype=jnp.int32)
 
 
 def _fill_tendons(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
@@ -145,30 +288,24 @@ def _fill_tendons(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data
     return model, filled
 
 
-def _substep(
-    model: mjx.Model,
-    rest: mjx.Data,
-    ctrl: jax.Array,
-    qpos: jax.Array,
-    qvel: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
+def _free_substep(model: mjx.Model, start: mjx.Data, moving: Moving) -> Moving:
     """One physics step without constraints: MJX's own stages, less the idle ones.
 
     Left out are the forces applied from outside (there are none) and the sensors
     (read once, at the end of the control period).
     """
-    data = rest.replace(qpos=qpos, qvel=qvel, ctrl=ctrl)
+    qpos, qvel, warmstart = moving
+    data = start.replace(qpos=qpos, qvel=qvel)
     data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
     data = mjx.fwd_actuation(model, data)
     force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
     data = mjx.euler(model, data.replace(qfrc_smooth=force))
-    return data.qpos, data.qvel
+    return data.qpos, data.qvel, warmstart
 
 
-def _refresh(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Positions and sensors of the state that `data` holds now.
-
-    `mjx.forward` skips the accelerometer where a model has no constraint at all, so
-    that stage is called here.
-    """
-    return mjx.sensor_acc(model, mjx.forward(model, data))
+def _contact_substep(model: mjx.Model, start: mjx.Data, moving: Moving) -> Moving:
+    """One physics step with contacts; what is not carried on is never computed."""
+    qpos, qvel, warmstart = moving
+    data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+    data = mjx.step(model, data)
+    return data.qpos, data.qvel, data.qacc_warmstart
