@@ -1,4 +1,4 @@
-"""`autocost`: train, evaluate, report, info."""
+"""`autocost`: train, evaluate, render, report, envs, info."""
 
 import json
 import sys
@@ -22,7 +22,9 @@ HELP = """usage: autocost COMMAND [flags]
 commands:
   train     train agents with any cost of the bank, several seeds at once
   evaluate  score the saved policies of a run over fresh episodes
+  render    replay an episode of a policy: an HTML page, and a film if asked for
   report    write a search's HTML report again
+  envs      a picture and the facts of every world
   info      versions, devices, environments, presets; or a run directory's facts
 
 `autocost COMMAND --help` lists the flags; the search itself is
@@ -34,8 +36,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command line; `argv` defaults to the program's."""
     argv = list(sys.argv[1:] if argv is None else argv)
     quiet()
-    commands = {"train": _train, "evaluate": _evaluate, "report": _report}
-    commands |= {"info": _info}
+    commands = {"train": _train, "evaluate": _evaluate, "render": _render}
+    commands |= {"report": _report, "envs": _envs, "info": _info}
     if not argv or argv[0] in ("-h", "--help"):
         print(HELP, end="")
         raise SystemExit(0 if argv else BAD_INPUT)
@@ -150,37 +152,30 @@ def _evaluate(argv: list[str]) -> None:
         raise ValueError(f"episodes must be >= 1, got {options.episodes}")
     import jax
 
-    from autocost_jax.arrays import RunDirError, write_atomic
+    from autocost_jax.arrays import write_atomic
     from autocost_jax.envs.env import make_env
     from autocost_jax.policies import (
         EVALUATION,
         eval_summary,
         load_policies,
+        policy_files,
         score_line,
     )
     from autocost_jax.population import make_evaluator
     from autocost_jax.rundata import to_json
 
     config = _run_config(options.run)
-    known = sorted(file.stem for file in (options.run / "policies").glob("*.npz"))
-    names = options.policies or known
-    odd = [name for name in names if name not in known]
-    if odd or not names:
-        raise RunDirError(
-            f"{options.run} has no policy {odd[0] if odd else ''!r}; "
-            f"policies: {', '.join(known) or 'none'}"
-        )
-    files = [options.run / "policies" / f"{name}.npz" for name in names]
+    files = policy_files(options.run, options.policies)
     agent, states = load_policies(config.train, files)
     env = make_env(config.train.env)
     run = make_evaluator(env, agent, options.episodes, options.deterministic)
     key = jax.random.fold_in(jax.random.key(options.seed), EVALUATION)
     results, _ = run(states, key)
     rows = []
-    for i, name in enumerate(names):
+    for i, file in enumerate(files):
         row = eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
-        rows.append({"policy": name, **row})
-        print(score_line(name, row))
+        rows.append({"policy": file.stem, **row})
+        print(score_line(file.stem, row))
     if options.json is not None:
         text = json.dumps(to_json(rows), indent=2, allow_nan=False)
         write_atomic(options.json, text.encode() + b"\n")
@@ -195,6 +190,63 @@ def _run_config(path: Path) -> Any:
     config = read_document(path).get("config")
     is_table = isinstance(config, dict) and "methods" in config
     return read_config(path, TableConfig if is_table else SearchConfig)[0]
+
+
+def _render(argv: list[str]) -> None:
+    @dataclass(frozen=True)
+    class Options:
+        """Replay one episode: an HTML page, and a film if --video is given.
+
+        Attributes:
+          run: run directory whose policy acts; or give --env.
+          env: world in which a scripted policy acts; `autocost info` lists them.
+          policy: file in the run's policies/, by default that of the best cost; with
+            --env: random (default), forward, or seek, which heads for the goal.
+          steps: length of the episode; default: the world's.
+          deterministic: act by the mean instead of sampling.
+          seed: of the layout and the actions.
+          out: the page; default: replays/POLICY.html in the run directory, or
+            runs/replays/ENV-POLICY.html.
+          video: film to write as well, .mp4 or .gif.
+          camera: of the film: track (the robot), fixed, or top.
+          size: width and height of the film; default: 640 480, a .gif's 480 360.
+        """
+
+        run: Path | None = None
+        env: str | None = None
+        policy: str | None = None
+        steps: int | None = None
+        deterministic: bool = False
+        seed: int = 0
+        out: Path | None = None
+        video: Path | None = None
+        camera: Literal["track", "fixed", "top"] = "track"
+        size: tuple[int, int] | None = None
+
+    options = parse(Options, argv, "autocost render")
+    if (options.run is None) == (options.env is None):
+        raise ValueError("give either --run DIR or --env NAME")
+    from autocost_jax.picture import film_size
+    from autocost_jax.render import best_policy, run_player, script_player, show
+
+    if options.video is not None:
+        film_size(options.video, options.size)  # refuses bad ones early
+    if options.run is not None:
+        config = _run_config(options.run)
+        name = options.policy or best_policy(options.run)
+        player = run_player(options.run, config, name, options.deterministic)
+    else:
+        player = script_player(options.env or "", options.policy or "random")
+    player = player.with_steps(options.steps)
+    for line in show(
+        player,
+        seed=options.seed,
+        out=options.out,
+        video=options.video,
+        camera=options.camera,
+        size=options.size,
+    ):
+        print(line, flush=True)
 
 
 def _report(argv: list[str]) -> None:
@@ -216,6 +268,34 @@ def _report(argv: list[str]) -> None:
 
     out = options.out or options.run / "report" / "index.html"
     print(write_report(load_report(options.run), out))
+
+
+def _envs(argv: list[str]) -> None:
+    import tyro
+
+    @dataclass(frozen=True)
+    class Options:
+        """A picture and the facts of every world, and a page that shows them all.
+
+        Attributes:
+          names: worlds that `autocost info` lists; default: the twelve.
+          out: folder to write to.
+          seed: of the layouts.
+        """
+
+        names: tyro.conf.Positional[tuple[str, ...]] = ()
+        out: Path = Path("runs/envs")
+        seed: int = 0
+
+    options = parse(Options, argv, "autocost envs")
+    from autocost_jax.env_config import ENVS
+    from autocost_jax.gallery import write_gallery
+
+    names = options.names or tuple(ENVS)
+    gallery = write_gallery(names, options.out, options.seed)
+    if gallery.hint is not None:
+        print(f"drawn from above: {gallery.hint}")
+    print(f"{len(gallery.pictures)} pictures; open {gallery.index}")
 
 
 def _info(argv: list[str]) -> None:

@@ -1,5 +1,6 @@
 """Whole episodes of a fixed policy on fresh layouts."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,23 +18,24 @@ class Episodes(struct.PyTreeNode):
 
     Attributes:
       start: layouts at the start, fields [E, ...].
-      robot_xy: [T, E, 2] robot origin, metres.
-      robot_yaw: [T, E] heading, radians.
-      goal_xy: [T, E, 2] goal centre, metres.
       reward: [T, E].
       cost_inputs: fields [T, E, ...].
       valid: [T, E] 1.0 until the world fails.
+      watched: what `watch` kept, of the start and of every step, leaves [T + 1, ...].
       distance_travelled: [E] path length, metres.
     """
 
     start: Layout
-    robot_xy: jax.Array
-    robot_yaw: jax.Array
-    goal_xy: jax.Array
     reward: jax.Array
     cost_inputs: CostInputs
     valid: jax.Array
+    watched: Any
     distance_travelled: jax.Array
+
+
+def _nothing(worlds: EnvState) -> tuple[()]:
+    del worlds
+    return ()
 
 
 def run_episodes(
@@ -43,6 +45,7 @@ def run_episodes(
     key: Key,
     num_episodes: int,
     deterministic: bool = False,
+    watch: Callable[[EnvState], Any] = _nothing,
 ) -> Episodes:
     """`num_episodes` whole episodes side by side.
 
@@ -53,6 +56,8 @@ def run_episodes(
       key: consumed.
       num_episodes: E.
       deterministic: act by the mean instead of sampling.
+      watch: worlds [E, ...] -> what else to keep of them, such as the poses that a
+        replay is made of.
     """
     key_reset, key_act = jax.random.split(key)
     start = reset_worlds(env, key_reset, num_episodes)
@@ -62,14 +67,16 @@ def run_episodes(
             agent_state, worlds.obs, jax.random.fold_in(key_act, t), deterministic
         )
         worlds = jax.vmap(env.step)(worlds, action)
-        layout, valid = worlds.layout, (~worlds.failed).astype(worlds.reward.dtype)
-        poses = (layout.robot_xy, layout.robot_yaw, layout.goal_xy)
-        return worlds, (*poses, worlds.reward, worlds.cost_inputs, valid)
+        valid = (~worlds.failed).astype(worlds.reward.dtype)
+        return worlds, (worlds.reward, worlds.cost_inputs, valid, watch(worlds))
 
     worlds, rows = jax.lax.scan(body, start, jnp.arange(env.episode_length))
-    return Episodes(
-        start.layout, *rows, worlds.metrics["distance_travelled"].astype(jnp.float32)
+    *scores, watched = rows
+    watched = jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None], rest]), watch(start), watched
     )
+    travelled = worlds.metrics["distance_travelled"].astype(jnp.float32)
+    return Episodes(start.layout, *scores, watched, travelled)
 
 
 def score(episodes: Episodes) -> EvalResult:

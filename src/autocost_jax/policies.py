@@ -1,7 +1,7 @@
 """Saved policies: their files, loading them, and their scores for people."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.agents.base import Agent
-from autocost_jax.arrays import load_arrays, unflatten
+from autocost_jax.arrays import RunDirError, load_arrays, unflatten
 from autocost_jax.config import TrainConfig
-from autocost_jax.envs.env import make_env
+from autocost_jax.envs.env import Env, make_env
 from autocost_jax.population import make_agents
-from autocost_jax.records import EvalResult
+from autocost_jax.records import EvalResult, Key
 
 EVALUATION = 2**31 - 1  # purpose of the final evaluation's key, beyond any stage
 
@@ -52,6 +52,99 @@ def load_policies(train: TrainConfig, files: Sequence[Path]) -> tuple[Agent, Any
     )
     policy = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loaded)
     return agent, dataclasses.replace(stacked, policy=policy)
+
+
+def policy_files(path: Path, names: Sequence[str] = ()) -> list[Path]:
+    """The files of a run's policies, all of them by default.
+
+    Raises:
+      RunDirError: one does not exist; the message lists those that do.
+    """
+    known = sorted(file.stem for file in (path / "policies").glob("*.npz"))
+    names = list(names) or known
+    odd = [name for name in names if name not in known]
+    if odd or not names:
+        raise RunDirError(
+            f"{path} has no policy {odd[0] if odd else ''!r}; "
+            f"policies: {', '.join(known) or 'none'}"
+        )
+    return [path / "policies" / f"{name}.npz" for name in names]
+
+
+def scripted_agent(name: str, env: Env) -> Agent:
+    """A policy that needs no training, in the shape of an agent; its state is unused.
+
+        random    every action uniform in [-1, 1], anew each step
+        forward   straight ahead at full thrust; the Doggo pushes with all its motors
+        seek      steers for the goal, or the box it must push, blind to all else
+
+    Raises:
+      ValueError: if there is no such policy for the robot.
+    """
+    known = [
+        script for script in SCRIPTS if script != "seek" or env.config.robot in TURNS
+    ]
+    if name not in known:
+        raise ValueError(
+            f"policy must be one of {', '.join(known)} for a {env.config.robot}, "
+            f"got {name!r}"
+        )
+
+    def policy(
+        state: Any, obs: jax.Array, key: Key, deterministic: bool = False
+    ) -> jax.Array:
+        del state, deterministic
+        return SCRIPTS[name](env, obs, key)
+
+    def update(*_: Any) -> Any:
+        raise NotImplementedError(f"the {name} policy does not learn")
+
+    return Agent(lambda key: jnp.zeros(()), policy, update)
+
+
+def _random(env: Env, obs: jax.Array, key: Key) -> jax.Array:
+    shape = (*obs.shape[:-1], env.action_size)
+    return jax.random.uniform(key, shape, obs.dtype, -1.0, 1.0)
+
+
+def _forward(env: Env, obs: jax.Array, key: Key) -> jax.Array:
+    del key
+    action = [1.0, 0.0] if env.config.robot == "Point" else [1.0] * env.action_size
+    return jnp.broadcast_to(
+        jnp.array(action, obs.dtype), (*obs.shape[:-1], len(action))
+    )
+
+
+def _seek(env: Env, obs: jax.Array, key: Key) -> jax.Array:
+    """The lidar's bins, as arrows from the robot, add up to where the target is."""
+    del key
+    target = "box_lidar" if env.config.task == "Push" else "goal_lidar"
+    bins = obs[..., env.obs_slices[target]]
+    angle = 2 * np.pi * (np.arange(bins.shape[-1]) + 0.5) / bins.shape[-1]
+    ahead, action = TURNS[env.config.robot]
+    x, y = (
+        (bins * np.cos(angle - ahead)).sum(-1),
+        (bins * np.sin(angle - ahead)).sum(-1),
+    )
+    return jnp.stack(action(jnp.arctan2(y, x)), -1)
+
+
+# Direction that is ahead in the robot's frame, and how to drive towards a bearing.
+# The Car faces its -y axis, so that its right motor is the left one to a driver.
+TURNS: dict[str, tuple[float, Callable[[jax.Array], list[jax.Array]]]] = {
+    "Point": (
+        0.0,
+        lambda bearing: [0.05 * jnp.cos(bearing), jnp.clip(1.5 * bearing, -1, 1)],
+    ),
+    "Car": (
+        -np.pi / 2,
+        lambda bearing: [
+            0.02 * (jnp.cos(bearing) + turn * jnp.clip(1.5 * bearing, -1, 1))
+            for turn in (1, -1)
+        ],
+    ),
+}
+SCRIPTS = {"random": _random, "forward": _forward, "seek": _seek}
 
 
 def eval_summary(result: EvalResult) -> dict[str, float | int]:

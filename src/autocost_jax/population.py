@@ -137,19 +137,26 @@ def make_population(
 
 
 def make_evaluator(
-    env: Env, agent: Agent, num_episodes: int, deterministic: bool = False
+    env: Env,
+    agent: Agent,
+    num_episodes: int,
+    deterministic: bool = False,
+    **options: Any,
 ) -> Callable[[Any, Key], tuple[EvalResult, Episodes]]:
     """Evaluate stacked policies in one compiled call.
 
     All policies meet the same layouts. `agent` may be any algorithm whose `policy`
-    understands the states: PPO-Lagrangian's acts for CPO's, too.
+    understands the states: PPO-Lagrangian's acts for CPO's, too. Options are those of
+    `run_episodes`.
 
     Returns:
       (agent states [P, ...], key) -> EvalResult [P, E] and Episodes [P, ...].
     """
 
     def evaluate_one(state: Any, key: Key) -> tuple[EvalResult, Episodes]:
-        episodes = run_episodes(env, agent, state, key, num_episodes, deterministic)
+        episodes = run_episodes(
+            env, agent, state, key, num_episodes, deterministic, **options
+        )
         return score(episodes), episodes
 
     return jax.jit(jax.vmap(evaluate_one, in_axes=(0, None)))

@@ -6,13 +6,7 @@ knows nothing of run directories. `stage_scatter`, `learning_curves` and `heat_m
 return matplotlib figures for other documents.
 """
 
-import importlib.resources
-import json
-import re
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from autocost_jax.arrays import write_atomic
 from autocost_jax.report_assets.cost_field import network_cost, object_lidar
@@ -21,7 +15,6 @@ from autocost_jax.report_assets.data import (
     BestCandidate,
     Curve,
     Evaluation,
-    Replay,
     ReportData,
     StageRecord,
 )
@@ -30,14 +23,15 @@ from autocost_jax.report_assets.figures import (
     learning_curves,
     stage_scatter,
 )
+from autocost_jax.report_assets.markup import asset, escape, fill, number, tiles
+from autocost_jax.report_assets.player import replay_data, replay_script
+from autocost_jax.report_assets.replay import Replay
 from autocost_jax.report_assets.sections import (
     best_section,
     config_section,
     curves_section,
-    escape,
     evaluations_section,
     evolution_section,
-    number,
     replay_section,
     stages_section,
 )
@@ -76,13 +70,10 @@ def render_report(data: ReportData) -> str:
         config_section,
     )
     sections = [make(data) for make in makers]
-    replay = ""
-    if data.replay is not None and len(data.replay.cost):
-        payload = _json(_replay_json(data.replay))
-        replay = f'<script type="application/json" id="replay-data">{payload}</script>'
+    has_replay = data.replay is not None and data.replay.steps > 0
     parts = {
         "title": escape(data.title),
-        "style": _asset("page.css"),
+        "style": asset("page.css"),
         "verdict": escape(verdict(data)),
         "tiles": _tiles(data),
         "sections": "\n".join(section for section in sections if section),
@@ -90,11 +81,11 @@ def render_report(data: ReportData) -> str:
         if data.deterministic
         else "stochastic: actions are sampled, also in the scored episodes",
         "timid": escape(f"{TIMID_DISTANCE:g}"),
-        "data": replay,
-        "script": _asset("replay.js"),
+        "obstacle": escape(data.obstacle),
+        "data": replay_data(data.replay) if has_replay else "",
+        "script": replay_script(),
     }
-    # one pass, so that braces inside the data are never taken for a name
-    return re.sub(r"\{\{(\w+)\}\}", lambda m: parts[m.group(1)], _asset("page.html"))
+    return fill(asset("page.html"), parts)
 
 
 def write_report(data: ReportData, path: str | Path) -> Path:
@@ -155,45 +146,12 @@ def _control_clause(data: ReportData) -> str:
     return f" (with random selection: {number(start)} to {number(end)})"
 
 
-def _asset(name: str) -> str:
-    folder = importlib.resources.files("autocost_jax") / "report_assets"
-    return (folder / name).read_text(encoding="utf-8")
-
-
-def _json(value: Any) -> str:
-    """Strict JSON that cannot close the script element it stands in."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace("&", "\\u0026")
-
-
-def _rounded(values: Any, digits: int) -> Any:
-    """Nested lists; null where a number is not finite."""
-    array = np.asarray(values, float)
-    if array.ndim:
-        return [_rounded(row, digits) for row in array]
-    return round(float(array), digits) if np.isfinite(array) else None
-
-
-def _replay_json(replay: Replay) -> dict[str, Any]:
-    names = ("robot_xy", "robot_yaw", "goal_xy", "hazards", "extents", "box_xy")
-    values: dict[str, Any] = {
-        name: None if value is None else _rounded(value, 4)
-        for name in names
-        for value in [getattr(replay, name)]
-    }
-    for name in ("cost", "reward", "intrinsic"):
-        values[name] = _rounded(getattr(replay, name), 6)
-    for name in ("hazard_radius", "goal_radius", "box_size", "dt"):
-        values[name] = float(getattr(replay, name))
-    return values | {"constraint_lidar": _rounded(replay.constraint_lidar, 3)}
-
-
 def _tiles(data: ReportData) -> str:
-    tiles = []
+    rows = []
     if data.stages:
         first, last = data.stages[0], data.stages[-1]
         arrow = f"{number(first.mean_cost)} → {number(last.mean_cost)}"
-        tiles.append(
+        rows.append(
             (
                 "Mean extrinsic cost",
                 arrow,
@@ -203,20 +161,16 @@ def _tiles(data: ReportData) -> str:
         zeros = [int(stage.zero_violation.sum()) for stage in data.stages]
         size = len(last.cost)
         ever = f"{sum(zeros)} over all stages; {zeros[0]} in the first"
-        tiles.append(("Zero violation, last stage", f"{zeros[-1]} of {size}", ever))
+        rows.append(("Zero violation, last stage", f"{zeros[-1]} of {size}", ever))
     if data.best is not None:
         stage, index = data.stages[data.best.stage], data.best.index
         scores = f"{number(stage.ep_return[index])} / {number(stage.cost[index])}"
-        tiles.append(("Best: return / extrinsic cost", scores, data.best.label))
+        rows.append(("Best: return / extrinsic cost", scores, data.best.label))
     if "duration" in data.config:
         known = [
             f"{data.config[key]} {key}" if key != "device" else data.config[key]
             for key in ("env steps", "steps/s", "device")
             if key in data.config
         ]
-        tiles.append(("Duration", data.config["duration"], ", ".join(known)))
-    cells = "".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd><dd>{escape(note)}</dd></div>"
-        for name, value, note in tiles
-    )
-    return f'<dl class="tiles">{cells}</dl>' if tiles else ""
+        rows.append(("Duration", data.config["duration"], ", ".join(known)))
+    return tiles(rows)

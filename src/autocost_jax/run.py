@@ -34,6 +34,7 @@ from autocost_jax.policies import (
 )
 from autocost_jax.population import make_evaluator
 from autocost_jax.progress import Display, format_seconds, summarise
+from autocost_jax.scene import first_recording, watch_first
 from autocost_jax.store import RunDir, check_free_space, estimate_bytes
 
 
@@ -280,7 +281,8 @@ def _finish(
     agent, states = load_policies(config.train, files)
     env = make_env(config.train.env)
     key = jax.random.fold_in(searcher.root, EVALUATION)
-    results, episodes = make_evaluator(env, agent, num_episodes)(states, key)
+    evaluator = make_evaluator(env, agent, num_episodes, watch=watch_first)
+    results, episodes = evaluator(states, key)
     is_zero = bool(best.zero_violation)
     card = {
         "label": "zero violation, highest return" if is_zero else "lowest cost",
@@ -297,8 +299,8 @@ def _finish(
         },
     }
     run.write_cost({"theta": np.asarray(best.candidate)}, card)
-    first = jax.tree.map(lambda leaf: np.asarray(leaf[0]), episodes)
-    run.write_arrays("replay", _replay_arrays(first))
+    first = first_recording(jax.tree.map(lambda leaf: leaf[0], episodes))
+    run.write_arrays("replay", first._asdict())
     report = write_report(load_report(run.path), run.path / "report" / "index.html")
     for line in finish_lines(card, report, display.elapsed):
         display.say(line)
@@ -314,16 +316,3 @@ def finish_lines(card: dict[str, Any], report: Path, elapsed: float) -> list[str
     for name, row in card["evaluation"].items():
         lines.append("  " + score_line(name, row))
     return [*lines, f"done in {format_seconds(elapsed)}; open {report}"]
-
-
-def _replay_arrays(episodes: Any) -> dict[str, np.ndarray]:
-    """The first of one policy's episodes, as the report's replay needs it."""
-    return {
-        "robot_xy": episodes.robot_xy[:, 0],
-        "robot_yaw": episodes.robot_yaw[:, 0],
-        "goal_xy": episodes.goal_xy[:, 0],
-        "hazards": episodes.start.hazards[0],
-        "reward": episodes.reward[:, 0],
-        "cost": episodes.cost_inputs.cost[:, 0],
-        "constraint_lidar": episodes.cost_inputs.constraint_lidar[:, 0],
-    }

@@ -8,16 +8,16 @@ import numpy as np
 
 from autocost_jax.arrays import RunDirError, load_arrays
 from autocost_jax.config import SearchConfig
-from autocost_jax.envs.env import make_env
 from autocost_jax.report import (
     BestCandidate,
     Curve,
     Evaluation,
-    Replay,
     ReportData,
     StageRecord,
     network_cost,
 )
+from autocost_jax.report_assets.replay import Replay
+from autocost_jax.scene import Recording, make_replay
 from autocost_jax.store import list_stages, read_config, read_metrics
 
 
@@ -32,12 +32,14 @@ def load_report(path: str | Path) -> ReportData:
     rows = read_metrics(path)
     stages = tuple(_stage(config, file) for file in list_stages(path).values())
     card = _read_card(path)
+    obstacle = config.train.env.constrained[0]
     return ReportData(
         title=f"AutoCost on {config.train.env.name}",
         config=_config_lines(config, facts, rows),
         algorithms=config.algorithms,
         deterministic=False,
-        hazard_radius=config.train.env.hazards_size,
+        obstacle=obstacle[:-1],
+        obstacle_radius=getattr(config.train.env, f"{obstacle}_size"),
         stages=stages,
         best=_best(stages, card),
         curves=tuple(_curves(config, rows)),
@@ -147,15 +149,13 @@ def _replay(path: Path, config: SearchConfig) -> Replay | None:
     if not (file.exists() and cost.exists()):
         return None
     arrays: dict[str, Any] = dict(load_arrays(file, None))
-    env = make_env(config.train.env)
+    if arrays.keys() != set(Recording._fields):
+        return None  # written by an earlier version, which kept no joint positions
     theta = load_arrays(cost, None)["theta"]
-    return Replay(
-        **arrays,
-        hazard_radius=config.train.env.hazards_size,
-        goal_radius=config.train.env.goal_size,
+    return make_replay(
+        config.train.env,
+        Recording(**arrays),
         intrinsic=network_cost(theta, arrays["constraint_lidar"]),
-        dt=env.dt,
-        extents=config.train.env.placements_extents,
         label=f"{config.algorithms[0]} trained with the best cost, sampled actions",
     )
 

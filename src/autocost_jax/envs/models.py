@@ -14,6 +14,7 @@ All models of a configuration have the same `qpos`: the robot's, then the box's 
 (Push), then seven of each vase.
 """
 
+from collections.abc import Sequence
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -35,7 +36,13 @@ WHEELS = (("left", -0.03), ("right", 0.03))  # body, x of the wheel's centre
 # allow four too, but only two on one side of it.
 NEAREST = {"Point": 2, "Car": 3, "Doggo": 4}
 NEAREST_TO_BOX = 2
-REDUCED_ITERATIONS, REDUCED_LINE_SEARCH = 4, 6
+# Contacts that the solver sees, the deepest ones: on the floor (a wheel has two at a
+# time), with pillars, with a box or vase, and between that and floor or pillars.
+FLOOR_CONTACTS = {"Point": 0, "Car": 5, "Doggo": 8}
+PILLAR_CONTACTS, SOLID_CONTACTS = 3, 8
+REDUCED_ITERATIONS = 8
+FULL_ITERATIONS = 20
+BALL_HEIGHT = 0.08  # within the height of all upright boxes of Point and Car
 
 
 class PhysicsModel(NamedTuple):
@@ -97,11 +104,12 @@ def physics_model(config: EnvConfig) -> PhysicsModel:
         robot += _complete(spec, config, robot)
     else:
         robot += _reduce(spec, config)
-    # The sparse factorisation is plain arithmetic; the dense one calls LAPACK for every
-    # world, which took about 10 % more CPU time.
+    # The sparse factorisation of the mass matrix is plain arithmetic; the dense one calls
+    # LAPACK for every world: slower, and on a CPU two such calls can wait for each other
+    # for ever.
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     has_contacts = bool(has_floor or config.pillars_num)
     if not has_contacts:
-        spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
         off = mujoco.mjtDisableBit
         spec.option.disableflags |= int(off.mjDSBL_CONTACT | off.mjDSBL_CONSTRAINT)
     return _label(spec.compile(), robot, has_contacts)
@@ -170,6 +178,7 @@ def _add_marker(spec: Any, name: str, height: float, size: list[float]) -> None:
 
 def _complete(spec: Any, config: EnvConfig, robot: list[str]) -> list[str]:
     """Safety Gym's collisions where MJX has them; returns the names of new geoms."""
+    spec.option.iterations = FULL_ITERATIONS
     if config.robot == "Point" and spec.geom("floor") is not None:
         spec.add_exclude(bodyname1="world", bodyname2="robot")
     for i in range(config.pillars_num):
@@ -185,7 +194,7 @@ def _complete(spec: Any, config: EnvConfig, robot: list[str]) -> list[str]:
         _add_proxy(spec, wheel, proxies[-1], SPHERE, [0.05, 0, 0], pos=[x, 0, 0])
         parts = BOX_PARTS if config.task == "Push" else ()
         for name in (*parts, *(f"vase{i}" for i in range(config.vases_num))):
-            _add_pair(spec, proxies[-1], name, condim=6)
+            _add_pair(spec, proxies[-1], name)
         bodies = ("box",) if config.task == "Push" else ()
         for name in (*bodies, *(f"vase{i}" for i in range(config.vases_num))):
             spec.add_exclude(bodyname1=wheel, bodyname2=name)
@@ -195,12 +204,9 @@ def _complete(spec: Any, config: EnvConfig, robot: list[str]) -> list[str]:
 def _reduce(spec: Any, config: EnvConfig) -> list[str]:
     """Contacts by explicit pairs alone; returns the names of the robot's new geoms.
 
-    Original geoms stay as carriers of mass. Everything is condim 3.
+    Original geoms stay as carriers of mass. Condim is 6, as everywhere.
     """
-    for geom in spec.geoms:
-        geom.contype = geom.conaffinity = 0
     spec.option.iterations = REDUCED_ITERATIONS
-    spec.option.ls_iterations = REDUCED_LINE_SEARCH
     reduce_robot = {"Point": _reduce_point, "Car": _reduce_car, "Doggo": _reduce_doggo}
     hull, pushers, floor, new = reduce_robot[config.robot](spec)
     for name in floor:
@@ -216,16 +222,36 @@ def _reduce(spec: Any, config: EnvConfig) -> list[str]:
     for i, vase in enumerate(vases):
         for other in vases[:i]:
             _add_pair(spec, vase, other)
-    size = [config.pillars_size, config.pillars_height, 0]
     for i in range(min(NEAREST[config.robot], config.pillars_num)):
-        _add_pillar(spec, f"pillar{i}", CAPSULE, size)
-        for name in hull:
-            _add_pair(spec, name, f"pillar{i}")
+        _add_pillar_pairs(spec, config, f"pillar{i}", hull, BALL_HEIGHT)
     for i in range(min(NEAREST_TO_BOX, config.pillars_num) if parts else 0):
-        _add_pillar(spec, f"stop{i}", CAPSULE, size)
-        for name in parts:
-            _add_pair(spec, name, f"stop{i}")
+        _add_pillar_pairs(spec, config, f"stop{i}", parts, config.box_size)
+    cap = FLOOR_CONTACTS[config.robot] + SOLID_CONTACTS * (bool(parts) + len(vases))
+    cap += PILLAR_CONTACTS if config.pillars_num else 0
+    spec.add_numeric(name="max_contact_points", data=[cap], size=1)
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
     return new
+
+
+def _add_pillar_pairs(
+    spec: Any, config: EnvConfig, name: str, others: Sequence[str], height: float
+) -> None:
+    """A pillar and what may touch it.
+
+    Boxes stand upright, and meet a ball of the pillar's radius at their own height: the
+    same distance in the plane, one contact point in place of two, and no search for the
+    closest edge.
+    """
+    size = [config.pillars_size, config.pillars_height, 0]
+    _add_pillar(spec, name, CAPSULE, size)
+    is_box = [spec.geom(other).type == BOX for other in others]
+    if any(is_box):
+        pos = [0, 0, height - config.pillars_height]
+        ball = [config.pillars_size, 0, 0]
+        _add_proxy(spec, name, f"{name}_ball", SPHERE, ball, pos=pos)
+    for other, upright in zip(others, is_box, strict=True):
+        _add_pair(spec, other, f"{name}_ball" if upright else name)
 
 
 # Each returns the geoms that meet pillars, those that meet the box and vases, those
@@ -241,31 +267,54 @@ def _reduce_point(spec: Any) -> _Hull:
     """
     ends = [0.13, -0.03, 0, 0.13, 0.03, 0]
     _add_proxy(spec, "robot", "arrow_bar", CAPSULE, [0.02, 0, 0], fromto=ends)
-    hull = ["robot", "pointarrow"]
-    return hull, ["robot", "arrow_bar"], [], ["arrow_bar"]
+    return ["robot", "pointarrow"], ["robot", "arrow_bar"], [], ["arrow_bar"]
 
 
 def _reduce_car(spec: Any) -> _Hull:
-    """Two boxes fill the gaps between chassis and bumpers; wheels become spheres."""
-    _add_proxy(spec, "robot", "hull", BOX, [0.1, 0.13, 0.05], pos=[0, 0.03, 0])
-    _add_proxy(spec, "robot", "nose", BOX, [0.05, 0.0375, 0.05], pos=[0, -0.1375, 0])
-    spheres = []
-    for wheel, x in WHEELS:
-        spheres.append(f"{wheel}_sphere")
-        _add_proxy(spec, wheel, spheres[-1], SPHERE, [0.05, 0, 0], pos=[x, 0, 0])
-    hull = ["hull", "nose", *spheres]
-    return hull, hull, [*spheres, "rear"], hull
+    """Wheels and caster on the floor; at objects its outline, fixed to the chassis.
+
+    The outline that meets pillars are four upright boxes: one fills the gap between
+    chassis and back bumper, one that to the front bumper, two stand where the wheels
+    are. At boxes it is a bar along either bumper, and balls at shoulders and wheels.
+    """
+    outline = {
+        "hull": ([0.1, 0.13, 0.05], [0, 0.03, 0]),
+        "nose": ([0.05, 0.0375, 0.05], [0, -0.1375, 0]),
+        "left_side": ([0.025, 0.05, 0.05], [-0.13, 0.1, -0.05]),
+        "right_side": ([0.025, 0.05, 0.05], [0.13, 0.1, -0.05]),
+    }
+    for name, (size, pos) in outline.items():
+        _add_proxy(spec, "robot", name, BOX, size, pos=pos)
+    balls = {
+        "left_shoulder": (0.02, [-0.08, -0.08, 0]),
+        "right_shoulder": (0.02, [0.08, -0.08, 0]),
+        "left_ball": (0.05, [-0.105, 0.1, -0.05]),
+        "right_ball": (0.05, [0.105, 0.1, -0.05]),
+    }
+    for name, (radius, pos) in balls.items():
+        _add_proxy(spec, "robot", name, SPHERE, [radius, 0, 0], pos=pos)
+    front = [-0.03, -0.155, 0, 0.03, -0.155, 0]
+    back = [-0.08, 0.14, 0, 0.08, 0.14, 0]
+    for name, ends in (("front_bar", front), ("back_bar", back)):
+        _add_proxy(spec, "robot", name, CAPSULE, [0.02, 0, 0], fromto=ends)
+    pushers = ["front_bar", "back_bar", *balls]
+    return list(outline), pushers, ["left", "right", "rear"], [*outline, *pushers]
 
 
 def _reduce_doggo(spec: Any) -> _Hull:
-    """Legs without their innermost piece, a torso of two capsules, no self-contact."""
+    """Every geom on the floor; at objects outer legs and a torso of two capsules.
+
+    The robot does not touch itself.
+    """
+    floor = [geom.name for geom in spec.geoms if geom.name not in ("floor", *BOX_PARTS)]
+    floor = [name for name in floor if not name.startswith("vase")]
     torso = [("robot", "torso_front", 0.125), ("rear", "torso_rear", -0.125)]
     for body, name, x in torso:
         ends = [0, 0, 0, x, 0, 0]
         _add_proxy(spec, body, name, CAPSULE, [0.075, 0, 0], fromto=ends)
     new = [name for _, name, _ in torso]
     hull = new + [f"{part}_{leg}" for part in ("hip", "ankle") for leg in range(1, 5)]
-    return hull, hull, hull, new
+    return hull, hull, floor, new
 
 
 def _add_proxy(
@@ -277,8 +326,8 @@ def _add_proxy(
     )
 
 
-def _add_pair(spec: Any, name: str, other: str, condim: int = 3) -> None:
+def _add_pair(spec: Any, name: str, other: str) -> None:
     """A possible contact, with the friction MuJoCo would give the two geoms."""
     slide, spin, roll = np.maximum(spec.geom(name).friction, spec.geom(other).friction)
     friction = [slide, slide, spin, roll, roll]
-    spec.add_pair(geomname1=name, geomname2=other, condim=condim, friction=friction)
+    spec.add_pair(geomname1=name, geomname2=other, condim=6, friction=friction)

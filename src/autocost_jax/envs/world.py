@@ -15,6 +15,7 @@ from mujoco import mjx
 
 from autocost_jax.env_config import EnvConfig
 from autocost_jax.envs.models import PhysicsModel, mujoco, physics_model
+from autocost_jax.envs.solver import solve_constraints
 from autocost_jax.records import Bodies, Layout, PhysicsState
 
 Moving = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, qacc_warmstart
@@ -206,9 +207,10 @@ def _observe(
     model = scene.model
     qpos, qvel, warmstart = moving
     data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-    data = mjx.forward(model, data)
-    if not scene.physics.has_contacts:
-        data = mjx.sensor_acc(model, data)
+    if scene.physics.has_contacts:
+        data = _forward(model, data)
+    else:
+        data = mjx.sensor_acc(model, mjx.forward(model, data))
     return PhysicsState(
         qpos=qpos,
         qvel=qvel,
@@ -307,5 +309,40 @@ def _contact_substep(model: mjx.Model, start: mjx.Data, moving: Moving) -> Movin
     """One physics step with contacts; what is not carried on is never computed."""
     qpos, qvel, warmstart = moving
     data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-    data = mjx.step(model, data)
+    data = mjx.euler(model, _forward(model, data))
     return data.qpos, data.qvel, data.qacc_warmstart
+
+
+def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.forward` with MuJoCo's contact frames and this package's solver."""
+    data = mjx.com_pos(model, mjx.kinematics(model, data))
+    data = mjx.factor_m(model, mjx.crb(model, data))
+    data = _align_frames(model, mjx.collision(model, data))
+    data = mjx.transmission(model, mjx.make_constraint(model, data))
+    data = mjx.sensor_vel(model, mjx.fwd_velocity(model, mjx.sensor_pos(model, data)))
+    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+    data = solve_constraints(model, data, int(model.opt.iterations))
+    return mjx.sensor_acc(model, data)
+
+
+def _align_frames(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Contact frames of capsules on the floor along the capsule, as in MuJoCo.
+
+    MJX turns them to a fixed direction where the capsule stands steeper than 60
+    degrees; the friction pyramid then stands otherwise, which half of all steps of a
+    Doggo feel.
+    """
+    impl: Any = data._impl
+    contact = impl.contact
+    kinds = jnp.asarray(model.geom_type)[contact.geom]
+    plane, capsule = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE
+    lies = (kinds[:, 0] == int(plane)) & (kinds[:, 1] == int(capsule))
+    normal = contact.frame[:, 0]
+    axis = data.geom_xmat[contact.geom[:, 1], :, 2]
+    along = axis - normal * (normal * axis).sum(-1, keepdims=True)
+    length = jnp.sqrt((along**2).sum(-1, keepdims=True))
+    along = along / jnp.maximum(length, 1e-6)
+    frame = jnp.stack([normal, along, jnp.cross(normal, along)], axis=1)
+    lies &= length[:, 0] > 1e-6
+    frame = jnp.where(lies[:, None, None], frame, contact.frame)
+    return data.tree_replace({"_impl.contact.frame": frame})

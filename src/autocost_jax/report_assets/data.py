@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from autocost_jax.report_assets.cost_field import LIDAR_BINS, THETA_SIZE, Array
+from autocost_jax.report_assets.cost_field import THETA_SIZE, Array
+from autocost_jax.report_assets.replay import Replay
 
 BestLabel = Literal["zero violation, highest return", "lowest cost"]
 
@@ -25,7 +26,7 @@ class StageRecord:
       algorithm_return: [A, P] the same return of each algorithm's agent.
       zero_violation: [P] bool, whether no fitness episode had any extrinsic cost.
       elites: [K] indices of the candidates that were selected, best first.
-      far_cost: [P] mean intrinsic cost over visited states far from hazards, or None.
+      far_cost: [P] mean intrinsic cost over visited states far from obstacles, or None.
       near_cost: [P] the same close to hazards, or None. NaN: no such state.
       distance_travelled: [A, P] metres an episode, or None.
     """
@@ -106,45 +107,6 @@ class BestCandidate:
     card: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Replay:
-    """One recorded episode; row t is the state after step t, world frame, metres.
-
-    Attributes:
-      robot_xy: [T, 2] robot origin.
-      robot_yaw: [T] heading, radians counter-clockwise from +x.
-      goal_xy: [T, 2] goal centre.
-      hazards: [H, 2] centres of the constraint objects (hazards or pillars).
-      hazard_radius: their radius.
-      goal_radius: radius of the goal.
-      cost: [T] extrinsic cost of each step.
-      reward: [T] reward of each step.
-      constraint_lidar: [T, 8] the network's input, robot frame.
-      intrinsic: [T] intrinsic cost of each step.
-      dt: seconds a step.
-      extents: (xmin, ymin, xmax, ymax) of the placements.
-      label: which policy this is, such as "PPO-Lagrangian, sampled actions".
-      box_xy: [T, 2] box centre of a push task, or None.
-      box_size: half the edge of the box.
-    """
-
-    robot_xy: Array
-    robot_yaw: Array
-    goal_xy: Array
-    hazards: Array
-    hazard_radius: float
-    goal_radius: float
-    cost: Array
-    reward: Array
-    constraint_lidar: Array
-    intrinsic: Array
-    dt: float
-    extents: tuple[float, float, float, float]
-    label: str = ""
-    box_xy: Array | None = None
-    box_size: float = 0.2
-
-
 @dataclass(frozen=True)
 class Evaluation:
     """One row of the evaluation table.
@@ -178,7 +140,8 @@ class ReportData:
         keys "env steps", "duration", "steps/s" and "device" if they are there.
       algorithms: the A names, in the order of the [A, P] arrays.
       deterministic: whether the scored policies used the mean action.
-      hazard_radius: radius of a constraint object, for the heat map.
+      obstacle: what must be avoided, as a word in the singular: "hazard".
+      obstacle_radius: its radius, for the heat map.
       stages: the finished stages; empty while the first is running.
       best: the result, or None if no stage has a finite candidate.
       curves: learning curves, any order.
@@ -197,7 +160,8 @@ class ReportData:
     config: Mapping[str, str]
     algorithms: tuple[str, ...]
     deterministic: bool
-    hazard_radius: float
+    obstacle: str
+    obstacle_radius: float
     stages: tuple[StageRecord, ...] = ()
     best: BestCandidate | None = None
     curves: tuple[Curve, ...] = ()
@@ -213,8 +177,6 @@ class ReportData:
             _check_curve(curve, self.algorithms, f"curves[{number}]")
         if self.best is not None:
             _check_best(self.best, self.stages)
-        if self.replay is not None:
-            _check_replay(self.replay)
 
 
 def _shape(value: Any, shape: tuple[int, ...], name: str) -> None:
@@ -260,16 +222,6 @@ def _check_best(best: BestCandidate, stages: tuple[StageRecord, ...]) -> None:
         raise ValueError(
             f"best.label must be {allowed!r} for this candidate, got {best.label!r}"
         )
-
-
-def _check_replay(replay: Replay) -> None:
-    steps = len(replay.cost)
-    for key in ("robot_xy", "goal_xy", "box_xy"):
-        _shape(getattr(replay, key), (steps, 2), f"replay.{key}")
-    for key in ("robot_yaw", "reward", "intrinsic"):
-        _shape(getattr(replay, key), (steps,), f"replay.{key}")
-    _shape(replay.constraint_lidar, (steps, LIDAR_BINS), "replay.constraint_lidar")
-    _shape(replay.hazards, (len(replay.hazards), 2), "replay.hazards")
 
 
 def finite_mean(values: Array) -> float:

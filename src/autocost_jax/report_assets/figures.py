@@ -36,14 +36,15 @@ def learning_curves(data: ReportData) -> "Figure":
     return _row([draw for _, draw in curve_panels(data)])
 
 
-def heat_map(theta: Array, hazard_radius: float) -> "Figure":
-    """The evolved cost around one hazard at the origin, and its radial profile.
+def heat_map(theta: Array, radius: float, obstacle: str = "hazard") -> "Figure":
+    """The evolved cost around one obstacle at the origin, and its radial profile.
 
     Args:
       theta: [41] parameters of the network.
-      hazard_radius: metres.
+      radius: of the obstacle, metres.
+      obstacle: what to call it.
     """
-    return _row([draw for _, draw in heat_panels(theta, hazard_radius)])
+    return _row([draw for _, draw in heat_panels(theta, radius, obstacle)])
 
 
 def stage_panels(data: ReportData) -> list[tuple[str, Draw]]:
@@ -70,11 +71,11 @@ def curve_panels(data: ReportData) -> list[tuple[str, Draw]]:
     ]
 
 
-def heat_panels(theta: Array, hazard_radius: float) -> list[tuple[str, Draw]]:
+def heat_panels(theta: Array, radius: float, obstacle: str) -> list[tuple[str, Draw]]:
     """(name, drawing) of each panel of `heat_map`."""
     return [
-        ("map", lambda axes: _draw_heat(axes, theta, hazard_radius)),
-        ("profile", lambda axes: _draw_profile(axes, theta, hazard_radius)),
+        ("map", lambda axes: _draw_heat(axes, theta, radius)),
+        ("profile", lambda axes: _draw_profile(axes, theta, radius, obstacle)),
     ]
 
 
@@ -320,13 +321,14 @@ def _draw_heat(axes: "Axes", theta: Array, radius: float) -> None:
     _label(axes, "robot x, m", "robot y, m")
 
 
-def _draw_profile(axes: "Axes", theta: Array, radius: float) -> None:
+def _draw_profile(axes: "Axes", theta: Array, radius: float, obstacle: str) -> None:
     distance = np.linspace(0, 6 * radius, 181)[:, None]
     bearing = np.linspace(-np.pi, np.pi, 144, endpoint=False)
     ego = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], -1)
     cost = network_cost(theta, object_lidar(ego))
     x = distance[:, 0]
-    axes.axvspan(0, radius, color=LIMIT, alpha=0.1, lw=0, label="inside the hazard")
+    inside = f"inside the {obstacle}"
+    axes.axvspan(0, radius, color=LIMIT, alpha=0.1, lw=0, label=inside)
     axes.fill_between(
         x, cost.min(1), cost.max(1), color=BEST, alpha=0.18, lw=0, label="range"
     )
@@ -334,4 +336,4 @@ def _draw_profile(axes: "Axes", theta: Array, radius: float) -> None:
     axes.set_ylim(0, 1.05 * max(float(cost.max()), 1e-12))
     axes.set_xlim(0, x[-1])
     _legend(axes)
-    _label(axes, "distance to the hazard's centre, m", "intrinsic cost a step")
+    _label(axes, f"distance to the {obstacle}'s centre, m", "intrinsic cost a step")

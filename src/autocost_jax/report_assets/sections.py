@@ -1,10 +1,6 @@
 """The sections of the report's page; an empty string where there is no data."""
 
-import html
-import math
-import re
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -16,34 +12,9 @@ from autocost_jax.report_assets.figures import (
     heat_panels,
     stage_panels,
 )
+from autocost_jax.report_assets.markup import escape, number, percent, section
+from autocost_jax.report_assets.player import replay_panel, replay_summary
 from autocost_jax.report_assets.svg import panel_svg
-
-
-def escape(value: Any) -> str:
-    """HTML text in which nothing is markup, quotes included."""
-    return html.escape(str(value), quote=True)
-
-
-def number(value: float) -> str:
-    """Three significant digits; a small cost never reads as 0."""
-    value = float(value)
-    if not math.isfinite(value):
-        return "–"
-    text = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-    return text.replace("-", "−", 1) if text.startswith("-") else text
-
-
-def percent(value: float) -> str:
-    """A share as a percentage; a dash if it is unknown."""
-    return f"{100 * value:.3g} %" if math.isfinite(value) else "–"
-
-
-def _section(name: str, title: str, lead: str, *content: str) -> str:
-    lead = f'<p class="lead">{lead}</p>' if lead else ""
-    return (
-        f'<section id="{name}" aria-labelledby="{name}-title">'
-        f'<h2 id="{name}-title">{title}</h2>{lead}{"".join(content)}</section>'
-    )
 
 
 def _figures(
@@ -111,10 +82,10 @@ def evolution_section(data: ReportData) -> str:
         "timid": (
             "Share of agents that hardly move, by stage, in percent: "
             f"{_series(100 * stage.timid_share for stage in stages)}.",
-            "The timid solution: agents that avoid hazards by standing still.",
+            f"The timid solution: avoiding every {data.obstacle} by standing still.",
         ),
     }
-    return _section(
+    return section(
         "evolution",
         "Evolution",
         "How the population changed from stage to stage.",
@@ -127,20 +98,21 @@ def best_section(data: ReportData) -> str:
     best = data.best
     if best is None:
         return ""
+    name = data.obstacle
     notes = {
         "map": (
-            "Heat map of the best intrinsic cost over robot positions around a hazard "
+            f"Heat map of the best intrinsic cost over robot positions around a {name} "
             "at the origin, which is drawn as a circle.",
-            "The robot looks along +x; a single hazard (circle) stands at the origin. "
+            f"The robot looks along +x; a single {name} (circle) stands at the origin. "
             "Lidar of 8 bins, exponential, gain 1. The scale starts at 0.",
         ),
         "profile": (
-            "The same cost against the distance to the hazard's centre.",
-            "A real world has several hazards, and few bins ever read 0: far away "
+            f"The same cost against the distance to the {name}'s centre.",
+            f"A real world has several {name}s, and few bins ever read 0: far away "
             "is not the same as alone.",
         ),
     }
-    panels = heat_panels(best.theta, data.hazard_radius)
+    panels = heat_panels(best.theta, data.obstacle_radius, name)
     where = f"Stage {best.stage + 1}, candidate {best.index}: {best.label}."
     theta = "\n".join(
         "  ".join(f"{value: .6g}" for value in best.theta[i : i + 4])
@@ -158,47 +130,16 @@ def best_section(data: ReportData) -> str:
         f"b2:</p><pre>{escape(theta)}</pre></details></div>"
     )
     figures = _figures("best", panels, notes, card)
-    return _section("best", "The best cost", escape(where), figures)
-
-
-_REPLAY = """<div class="stage"><div class="card">
-<canvas id="world" role="img" aria-label="{label}" data-frame="0"></canvas>
-<canvas id="timeline" role="img" aria-label="Intrinsic cost by step as a line; steps
-with extrinsic cost as red bars. Click to jump."></canvas>
-<div class="controls"><button id="play" type="button">Play</button>
-<input id="scrub" type="range" min="0" max="{last}" value="0" aria-label="Step">
-<label>Speed <select id="speed"><option value="0.5">0.5 ×</option>
-<option value="1">1 ×</option><option value="2" selected>2 ×</option>
-<option value="4">4 ×</option><option value="8">8 ×</option></select></label></div>
-</div><div class="card"><dl class="readout">
-<dt>Step</dt><dd id="now-step">–</dd><dt>Time</dt><dd id="now-time">–</dd>
-<dt>Return so far</dt><dd id="now-return">–</dd>
-<dt>Goals reached</dt><dd id="now-goals">–</dd>
-<dt>Extrinsic cost so far</dt><dd id="now-cost">–</dd>
-<dt>Steps with a violation</dt><dd id="now-hits">–</dd>
-<dt>Intrinsic cost so far</dt><dd id="now-intrinsic">–</dd>
-<dt>Intrinsic cost now</dt><dd id="now-step-intrinsic">–</dd></dl>
-<ul class="key"><li><i style="color:var(--hazard)"></i>hazard; around the robot: what
-its 8 lidar bins read</li><li><i style="color:var(--goal)"></i>goal; it moves when it
-is met</li><li><i style="color:var(--limit)"></i>violation: red frame, trail, bar</li>
-<li><i style="color:var(--best)"></i>timeline: intrinsic cost a step</li></ul>
-<noscript><p>The replay needs JavaScript.</p></noscript></div></div>"""
+    return section("best", "The best cost", escape(where), figures)
 
 
 def replay_section(data: ReportData) -> str:
-    """The canvases and controls that `replay.js` brings to life."""
-    replay = data.replay
-    if replay is None or not len(replay.cost):
+    """An episode of the best policy."""
+    if data.replay is None or not data.replay.steps:
         return ""
-    cost, reward = (float(np.nansum(x)) for x in (replay.cost, replay.reward))
-    label = (
-        f"One episode from above, {len(replay.cost)} steps; return "
-        f"{number(reward)}, extrinsic cost {number(cost)}."
-    )
-    parts = {"label": escape(label), "last": str(len(replay.cost) - 1)}
-    body = re.sub(r"\{(\w+)\}", lambda m: parts[m.group(1)], _REPLAY)
-    lead = f"{replay.label}. {label}" if replay.label else label
-    return _section("replay", "Replay of the best policy", escape(lead), body)
+    lead = f"{data.replay.label}. {replay_summary(data.replay)}".removeprefix(". ")
+    body = replay_panel(data.replay)
+    return section("replay", "Replay of the best policy", escape(lead), body)
 
 
 def evaluations_section(data: ReportData) -> str:
@@ -220,7 +161,7 @@ def evaluations_section(data: ReportData) -> str:
     table = _table(
         caption, head, rows, [r.violation_rate == 0 for r in data.evaluations]
     )
-    return _section("evaluation", "Evaluation on fresh episodes", "", table)
+    return section("evaluation", "Evaluation on fresh episodes", "", table)
 
 
 def curves_section(data: ReportData) -> str:
@@ -239,7 +180,7 @@ def curves_section(data: ReportData) -> str:
             ("ep_total_cost", "total cost", "Extrinsic + intrinsic: what is learnt."),
         )
     }
-    return _section(
+    return section(
         "learning",
         "Learning curves",
         "Agents start from scratch in every stage (dotted lines).",
@@ -268,7 +209,7 @@ def stages_section(data: ReportData) -> str:
     details = (
         f"<details><summary>Every candidate</summary>{_candidates(data)}</details>"
     )
-    return _section("stages", "Stages", "", _table(caption, head, rows), details)
+    return section("stages", "Stages", "", _table(caption, head, rows), details)
 
 
 def _candidates(data: ReportData) -> str:
@@ -303,4 +244,4 @@ def config_section(data: ReportData) -> str:
     if data.deterministic:
         rows[-1] = ("policies", policies)
     table = _table("What was run.", [], rows, kind="plain")
-    return _section("config", "Configuration", "", table)
+    return section("config", "Configuration", "", table)
