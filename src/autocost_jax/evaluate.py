@@ -71,12 +71,19 @@ def run_episodes(
         return worlds, (worlds.reward, worlds.cost_inputs, valid, watch(worlds))
 
     worlds, rows = jax.lax.scan(body, start, jnp.arange(env.episode_length))
-    *scores, watched = rows
-    watched = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest]), watch(start), watched
+    reward, cost_inputs, valid, watched = rows
+    return Episodes(
+        start=start.layout,
+        reward=reward,
+        cost_inputs=cost_inputs,
+        valid=valid,
+        watched=jax.tree.map(
+            lambda first, rest: jnp.concatenate([first[None], rest]),
+            watch(start),
+            watched,
+        ),
+        distance_travelled=worlds.metrics["distance_travelled"].astype(jnp.float32),
     )
-    travelled = worlds.metrics["distance_travelled"].astype(jnp.float32)
-    return Episodes(start.layout, *scores, watched, travelled)
 
 
 def score(episodes: Episodes) -> EvalResult:

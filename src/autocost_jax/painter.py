@@ -88,7 +88,7 @@ def _save_mp4(path: Path, images: Iterator[np.ndarray], size: tuple[int, int]) -
     import imageio_ffmpeg
 
     writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=FPS[".mp4"], quality=7, macro_block_size=2
+        str(path), size, fps=int(FPS[".mp4"]), quality=7, macro_block_size=2
     )
     writer.send(None)
     for image in images:

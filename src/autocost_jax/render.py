@@ -126,7 +126,7 @@ def _card(run: Path) -> dict[str, Any]:
 
 
 def record_episode(player: Player, seed: int) -> Recording:
-    """One whole episode, the first of `autocost evaluate --seed`."""
+    """One whole episode: that of `autocost evaluate --episodes 1 --seed SEED`."""
     env = make_env(player.config)
     agent, state = player.make_agent(env)
     is_mean = player.actions == "mean"

@@ -70,7 +70,7 @@ def render_report(data: ReportData) -> str:
         config_section,
     )
     sections = [make(data) for make in makers]
-    has_replay = data.replay is not None and data.replay.steps > 0
+    replay = data.replay if data.replay is not None and data.replay.steps else None
     parts = {
         "title": escape(data.title),
         "style": asset("page.css"),
@@ -82,7 +82,7 @@ def render_report(data: ReportData) -> str:
         else "stochastic: actions are sampled, also in the scored episodes",
         "timid": escape(f"{TIMID_DISTANCE:g}"),
         "obstacle": escape(data.obstacle),
-        "data": replay_data(data.replay) if has_replay else "",
+        "data": "" if replay is None else replay_data(replay),
         "script": replay_script(),
     }
     return fill(asset("page.html"), parts)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.env_config import EnvConfig
@@ -262,7 +263,7 @@ def lidar_readings(
         rows = [scene.model.body(f"vase{i}").id - 1 for i in range(config.vases_num)]
         targets["vases"] = poses[:, rows, :2]
 
-    def see(objects: jax.Array, position: jax.Array, rotation: jax.Array) -> jax.Array:
+    def see(objects: Any, position: Any, rotation: Any) -> jax.Array:
         return lidar(
             objects,
             position,
@@ -273,11 +274,11 @@ def lidar_readings(
             alias=config.lidar_alias,
         )
 
-    robot = poses[:, scene.robot]
-    rotation = _rotations(robot[:, 3:])
+    robot = np.asarray(poses[:, scene.robot], np.float32)
+    position, rotation = robot[:, :3], _rotations(robot[:, 3:])
     return {
         name: np.asarray(
-            jax.vmap(see)(*(np.float32(x) for x in (objects, robot[:, :3], rotation)))
+            jax.vmap(see)(jnp.asarray(objects, np.float32), position, rotation)
         )
         for name, objects in targets.items()
     }
@@ -288,7 +289,7 @@ def _rotations(quaternions: np.ndarray) -> np.ndarray:
     out = np.empty((len(quaternions), 9))
     for row, quaternion in enumerate(quaternions):
         mujoco.mju_quat2Mat(out[row], quaternion)
-    return out.reshape(-1, 3, 3)
+    return out.reshape(-1, 3, 3).astype(np.float32)
 
 
 def make_replay(

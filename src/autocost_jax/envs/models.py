@@ -39,10 +39,14 @@ NEAREST_TO_BOX = 2
 # Contacts that the solver sees, the deepest ones: on the floor (a wheel has two at a
 # time), with pillars, with a box or vase, and between that and floor or pillars.
 FLOOR_CONTACTS = {"Point": 0, "Car": 5, "Doggo": 8}
-PILLAR_CONTACTS, SOLID_CONTACTS = 3, 8
+PILLAR_CONTACTS, SOLID_CONTACTS = 4, 8
 REDUCED_ITERATIONS = 8
 FULL_ITERATIONS = 20
-BALL_HEIGHT = 0.08  # within the height of all upright boxes of Point and Car
+# Four corners carry the box in place of twenty; at 1.3 box_size its friction, turning
+# and tilt are on average those of the box with its posts.
+FOOT = 1.3
+# Where upright boxes meet a pillar: the Car's lower or upper edge, as it pitches.
+BALL_HEIGHTS = {"Point": (0.1,), "Car": (0.05, 0.15), "Doggo": ()}
 
 
 class PhysicsModel(NamedTuple):
@@ -76,6 +80,8 @@ def load_spec(robot: str) -> Any:
 def scene_model(config: EnvConfig) -> Any:
     """Safety Gym's scene as a `mujoco.MjModel`; nothing is simplified.
 
+    Several contacts for a convex pair are off: MuJoCo's search for them tilts the
+    normals of boxes at cylinders, and the versions that Safety Gym ran on had none.
     Pillars, goal and hazards are mocap bodies named `pillar0`, `goal`, `hazard0` and so
     on, so that one model serves every layout.
     """
@@ -89,6 +95,7 @@ def scene_model(config: EnvConfig) -> Any:
     _add_marker(spec, "goal", goal_height(config), size)
     for i in range(config.hazards_num):
         _add_marker(spec, f"hazard{i}", HAZARD_Z, [config.hazards_size, 0.01, 0])
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
     return spec.compile()
 
 
@@ -104,9 +111,9 @@ def physics_model(config: EnvConfig) -> PhysicsModel:
         robot += _complete(spec, config, robot)
     else:
         robot += _reduce(spec, config)
-    # The sparse factorisation of the mass matrix is plain arithmetic; the dense one calls
-    # LAPACK for every world: slower, and on a CPU two such calls can wait for each other
-    # for ever.
+    # The sparse factorisation of the mass matrix is plain arithmetic; the dense one
+    # calls LAPACK for every world: slower, and on a CPU two such calls can wait for
+    # each other for ever.
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     has_contacts = bool(has_floor or config.pillars_num)
     if not has_contacts:
@@ -213,8 +220,12 @@ def _reduce(spec: Any, config: EnvConfig) -> list[str]:
         _add_pair(spec, "floor", name)
     vases = [f"vase{i}" for i in range(config.vases_num)]
     parts = BOX_PARTS if config.task == "Push" else ()
-    # The posts end where the box does: its four corners carry it.
-    for name in (*parts[:1], *vases):
+    if parts:
+        size = config.box_size
+        half = [FOOT * size, FOOT * size, size]
+        _add_proxy(spec, "box", "foot", BOX, half)
+        _add_pair(spec, "floor", "foot")
+    for name in vases:
         _add_pair(spec, "floor", name)
     for part in (*parts, *vases):
         for name in pushers:
@@ -222,10 +233,11 @@ def _reduce(spec: Any, config: EnvConfig) -> list[str]:
     for i, vase in enumerate(vases):
         for other in vases[:i]:
             _add_pair(spec, vase, other)
+    heights = BALL_HEIGHTS[config.robot]
     for i in range(min(NEAREST[config.robot], config.pillars_num)):
-        _add_pillar_pairs(spec, config, f"pillar{i}", hull, BALL_HEIGHT)
+        _add_pillar_pairs(spec, config, f"pillar{i}", hull, heights)
     for i in range(min(NEAREST_TO_BOX, config.pillars_num) if parts else 0):
-        _add_pillar_pairs(spec, config, f"stop{i}", parts, config.box_size)
+        _add_pillar_pairs(spec, config, f"stop{i}", parts, (config.box_size,))
     cap = FLOOR_CONTACTS[config.robot] + SOLID_CONTACTS * (bool(parts) + len(vases))
     cap += PILLAR_CONTACTS if config.pillars_num else 0
     spec.add_numeric(name="max_contact_points", data=[cap], size=1)
@@ -235,23 +247,29 @@ def _reduce(spec: Any, config: EnvConfig) -> list[str]:
 
 
 def _add_pillar_pairs(
-    spec: Any, config: EnvConfig, name: str, others: Sequence[str], height: float
+    spec: Any,
+    config: EnvConfig,
+    name: str,
+    others: Sequence[str],
+    heights: Sequence[float],
 ) -> None:
     """A pillar and what may touch it.
 
-    Boxes stand upright, and meet a ball of the pillar's radius at their own height: the
-    same distance in the plane, one contact point in place of two, and no search for the
-    closest edge.
+    Boxes stand upright, and meet balls of the pillar's radius: the same distance in the
+    plane, one contact point for each, and no search for the closest edge.
     """
     size = [config.pillars_size, config.pillars_height, 0]
     _add_pillar(spec, name, CAPSULE, size)
-    is_box = [spec.geom(other).type == BOX for other in others]
-    if any(is_box):
+    upright = [other for other in others if spec.geom(other).type == BOX]
+    for other in others:
+        if other not in upright:
+            _add_pair(spec, other, name)
+    for i, height in enumerate(heights if upright else ()):
+        ball = f"{name}_ball{i}"
         pos = [0, 0, height - config.pillars_height]
-        ball = [config.pillars_size, 0, 0]
-        _add_proxy(spec, name, f"{name}_ball", SPHERE, ball, pos=pos)
-    for other, upright in zip(others, is_box, strict=True):
-        _add_pair(spec, other, f"{name}_ball" if upright else name)
+        _add_proxy(spec, name, ball, SPHERE, [config.pillars_size, 0, 0], pos=pos)
+        for other in upright:
+            _add_pair(spec, other, ball)
 
 
 # Each returns the geoms that meet pillars, those that meet the box and vases, those
@@ -262,11 +280,11 @@ _Hull = tuple[list[str], list[str], list[str], list[str]]
 def _reduce_point(spec: Any) -> _Hull:
     """Its own geoms at pillars; at boxes a bar across the arrow's front is the arrow.
 
-    The bar (a capsule of radius 0.02) has the arrow's reach ahead, 0.15, and its
-    width; it rounds the arrow's corners by less than a centimetre.
+    The bar (a capsule of radius 0.01) has the arrow's reach ahead, 0.15, and its
+    width; it rounds the arrow's corners by less than half a centimetre.
     """
-    ends = [0.13, -0.03, 0, 0.13, 0.03, 0]
-    _add_proxy(spec, "robot", "arrow_bar", CAPSULE, [0.02, 0, 0], fromto=ends)
+    ends = [0.14, -0.04, 0, 0.14, 0.04, 0]
+    _add_proxy(spec, "robot", "arrow_bar", CAPSULE, [0.01, 0, 0], fromto=ends)
     return ["robot", "pointarrow"], ["robot", "arrow_bar"], [], ["arrow_bar"]
 
 

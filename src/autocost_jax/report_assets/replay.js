@@ -283,7 +283,7 @@
       pen.fillStyle = palette.limit; pen.globalAlpha = 0.45;
       for (let t = 1; t <= last; t++) if (record.cost[t] > 0) pen.fillRect(at(t) - 0.5, height, Math.max(1.2, (width / last) * 0.9), -(height - 18) * (0.1 + (0.3 * record.cost[t]) / worst));
       pen.globalAlpha = 1;
-      if (record.intrinsic) line(pen, record.intrinsic, palette.third, 1, 0);
+      if (record.intrinsic) line(pen, record.intrinsic.map((v, t) => (t ? v : NaN)), palette.third, 1, 0); // frame 0 has no step
       line(pen, total.cost, palette.limit, 1.6, 0);
       line(pen, total.reward, palette.best, 2, Math.min(0, ...total.reward));
       pen.fillStyle = palette.goal;
@@ -293,7 +293,11 @@
       function line(pen, values, colour, thick, low) {
         const high = Math.max(low + 1e-9, ...Array.from(values, (v) => v || 0)), y = (v) => height - 4 - ((v - low) / (high - low)) * (height - 20);
         pen.strokeStyle = colour; pen.lineWidth = thick; pen.beginPath();
-        values.forEach((v, t) => { if (Number.isFinite(v)) { if (t) pen.lineTo(at(t), y(v)); else pen.moveTo(at(t), y(v)); } });
+        let down = false;
+        values.forEach((v, t) => {
+          if (Number.isFinite(v)) { if (down) pen.lineTo(at(t), y(v)); else pen.moveTo(at(t), y(v)); }
+          down = Number.isFinite(v);
+        });
         pen.stroke();
       }
     }
