@@ -37,9 +37,14 @@ ORDER = (
     "store",
     "report_assets.*",
     "report",
+    "scene",
     "summary",
     "progress",
     "policies",
+    "picture",
+    "painter",
+    "gallery",
+    "render",
     "run",
     "methods",
     "commandline",
@@ -65,6 +70,8 @@ DISTRIBUTION = {
     "orbax": "orbax-checkpoint",
     "yaml": "pyyaml",
     "mujoco.mjx": "mujoco-mjx",
+    "PIL": "pillow",
+    "imageio_ffmpeg": "imageio-ffmpeg",
 }
 
 

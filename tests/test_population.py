@@ -329,7 +329,7 @@ def test_the_evaluator_plays_the_same_layouts_for_all(key, reference):
     states = reference[0][0].agent
     result, episodes = make_evaluator(env, agent, 5)(states, key)
     assert result.ep_return.shape == (SIZE, 5)
-    assert episodes.robot_xy.shape == (SIZE, env.episode_length, 5, 2)
+    assert episodes.reward.shape == (SIZE, env.episode_length, 5)
     start = np.asarray(episodes.start.robot_xy)
     assert (start == start[:1]).all()
     assert len(np.unique(start[0], axis=0)) == 5

@@ -1,16 +1,14 @@
 import dataclasses
 import html
-import json
-import os
 import re
-import shutil
-import subprocess
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
-from autocost_jax import report
+from autocost_jax import report, scene
+from autocost_jax.env_config import EnvConfig
+from autocost_jax.scene import Recording
+from pages import browse, check_page
 
 TOL = 1e-6  # the goldens have six or seven digits
 HOSTILE = "<script>alert('x')</script>\" & {{script}} $a$ </title>"
@@ -51,8 +49,9 @@ def make_curve(rng, stage, algorithm, size, level, epochs=24):
     return report.Curve(stage, algorithm, np.arange(epochs), ep_return, cost, total)
 
 
-def make_replay(theta, steps=1000):
-    t = np.linspace(0, 1, steps)
+def make_recording(steps=1000):
+    """The Point drives a loop through four hazards; the goal moves twice."""
+    t = np.linspace(0, 1, steps + 1)
     xy = np.stack([1.5 * np.cos(9 * t) * (0.6 + 0.4 * t), 1.4 * np.sin(7 * t)], -1)
     velocity = np.gradient(xy, axis=0)
     yaw = np.arctan2(velocity[:, 1], velocity[:, 0])
@@ -66,21 +65,25 @@ def make_replay(theta, steps=1000):
         ],
         -1,
     )
-    lidar = report.object_lidar(ego).max(1)
     goals = np.array([[0.5, 1.2], [-1.4, -1.2], [1.6, -0.4]])
-    return report.Replay(
-        robot_xy=xy,
-        robot_yaw=yaw,
+    cost = np.maximum(0, 0.3 - np.hypot(*np.moveaxis(offset, -1, 0))).sum(1)
+    return Recording(
+        qpos=np.concatenate([xy, yaw[:, None]], 1),
         goal_xy=goals[(3 * t).astype(int).clip(0, 2)],
         hazards=hazards,
-        hazard_radius=0.3,
-        goal_radius=0.3,
-        cost=np.maximum(0, 0.3 - np.hypot(*np.moveaxis(offset, -1, 0))).sum(1),
-        reward=np.gradient(t) * 8,
-        constraint_lidar=lidar,
-        intrinsic=report.network_cost(theta, lidar),
-        dt=0.02,
-        extents=(-2.0, -2.0, 2.0, 2.0),
+        pillars=np.zeros((0, 2)),
+        reward=np.full(steps, 8 / steps),
+        cost=cost[1:],
+        constraint_lidar=report.object_lidar(ego).max(1)[1:],
+    )
+
+
+def make_replay(theta, steps=1000):
+    recording = make_recording(steps)
+    return scene.make_replay(
+        EnvConfig(hazards_num=4),
+        recording,
+        intrinsic=report.network_cost(theta, recording.constraint_lidar),
         label="PPO-Lagrangian, sampled actions",
     )
 
@@ -115,7 +118,8 @@ def make_data(size=8, zero=True, **changes):
         },
         algorithms=ALGORITHMS,
         deterministic=False,
-        hazard_radius=0.3,
+        obstacle="hazard",
+        obstacle_radius=0.3,
         stages=stages,
         best=report.BestCandidate(
             3,
@@ -139,72 +143,6 @@ def make_data(size=8, zero=True, **changes):
 def best_of(data):
     assert data.best is not None
     return data.best
-
-
-class Page(HTMLParser):
-    """Collects what a page could load, its ids, and its data blocks."""
-
-    VOID = ("meta", "link", "input", "br", "img")
-
-    def __init__(self, text):
-        super().__init__()
-        self.references, self.ids, self.tags, self.blocks = [], [], [], []
-        self.open, self.title, self.unclosed = [], "", []
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        for name, value in attrs:
-            if name in ("src", "href", "xlink:href", "srcset", "action", "data"):
-                self.references.append(value or "")
-            if name == "id":
-                self.ids.append(value)
-        if tag == "script" and ("type", "application/json") in attrs:
-            self.blocks.append("")
-        if tag not in self.VOID:
-            self.open.append((tag, attrs))
-
-    def handle_startendtag(self, tag, attrs):
-        self.handle_starttag(tag, attrs)
-        if tag not in self.VOID:
-            self.open.pop()
-
-    def handle_endtag(self, tag):
-        if self.open and self.open[-1][0] == tag:
-            self.open.pop()
-        else:
-            self.unclosed.append(tag)
-
-    def handle_data(self, data):
-        if not self.open:
-            return
-        tag, attrs = self.open[-1]
-        if tag == "script" and ("type", "application/json") in attrs:
-            self.blocks[-1] += data
-        if tag == "title" and "svg" not in [name for name, _ in self.open]:
-            self.title += data
-
-
-def reject_constant(name):
-    raise ValueError(name)
-
-
-def check_page(text):
-    page = Page(text)
-    for reference in page.references:
-        assert reference.startswith(("data:", "#")), reference[:80]
-    assert not re.search(r"https?://", text)
-    for address in re.findall(r"url\(\s*['\"]?([^)]*)", text):
-        assert address.startswith(("#", "data:")), address[:80]
-    assert not re.search(r"@import|\bimport\s*\(|fetch\(|XMLHttpRequest", text)
-    assert len(page.ids) == len(set(page.ids))
-    assert page.open == []
-    assert page.unclosed == []
-    for block in page.blocks:
-        json.loads(block, parse_constant=reject_constant)
-    fragments = [ref[1:] for ref in page.references if ref.startswith("#")]
-    assert set(fragments) <= set(page.ids)
-    return page
 
 
 def test_network_golden():
@@ -269,13 +207,18 @@ def test_all_candidates_may_diverge():
 
 
 def test_non_finite_replay_stays_strict_json():
-    replay = make_replay(golden_theta(), 20)
-    replay.robot_xy[3], replay.reward[4], replay.intrinsic[5] = np.nan, np.inf, np.nan
-    (block,) = check_page(report.render_report(make_data(replay=replay))).blocks
-    decoded = json.loads(block)
-    assert decoded["robot_xy"][3] == [None, None]
-    assert decoded["reward"][4] is None
-    assert decoded["intrinsic"][6] == pytest.approx(replay.intrinsic[6], abs=TOL)
+    recording = make_recording(20)
+    recording.qpos[12:], recording.reward[4] = np.nan, np.inf
+    intrinsic = np.full(20, np.nan)
+    replay = scene.make_replay(EnvConfig(hazards_num=4), recording, intrinsic=intrinsic)
+    check_page(report.render_report(make_data(replay=replay)))
+
+
+def test_the_obstacle_has_its_name():
+    text = report.render_report(make_data(obstacle="pillar", replay=None))
+    assert "single pillar" in text
+    assert "lidar of the pillars only" in text
+    assert "hazard" not in text.split("<style>")[0] + text.split("</style>")[1]
 
 
 def test_text_is_escaped():
@@ -342,9 +285,8 @@ def test_wrong_shapes_are_refused():
     curve = dataclasses.replace(data.curves[0], algorithm="sac")
     with pytest.raises(ValueError, match="ppo_lagrangian, cpo"):
         dataclasses.replace(data, curves=(curve,))
-    replay = dataclasses.replace(make_replay(steep_theta()), reward=np.zeros(3))
     with pytest.raises(ValueError, match=r"replay\.reward"):
-        dataclasses.replace(data, replay=replay)
+        dataclasses.replace(make_replay(steep_theta(), 9), reward=np.zeros(3))
 
 
 def test_paper_sized_report_is_small_and_repeatable(tmp_path):
@@ -373,33 +315,6 @@ def test_figures_save_as_png(tmp_path):
         assert len(figure.axes) == panels
         figure.savefig(tmp_path / f"{name}.png", dpi=60)
         assert (tmp_path / f"{name}.png").stat().st_size > 5_000
-
-
-def chromium():
-    names = ("chromium", "chromium-browser", "google-chrome")
-    found = next((path for name in names if (path := shutil.which(name))), None)
-    if found is None:
-        message = f"none of {', '.join(names)} is on PATH"
-        if os.environ.get("CI"):
-            pytest.fail(message)
-        pytest.skip(message)
-    return found
-
-
-def browse(tmp_path, page, *flags):
-    """Opens a page without a network; returns its final DOM and the browser's log."""
-    command = [
-        chromium(), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
-        "--no-first-run", "--disable-background-networking",
-        "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage",
-        "--host-resolver-rules=MAP * ~NOTFOUND", "--proxy-server=127.0.0.1:9",
-        f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr",
-        "--window-size=1200,3000", "--virtual-time-budget=4000", *flags,
-        "--dump-dom", page.as_uri() + "#replay",
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout, done.stderr
 
 
 def test_browser_plays_the_replay(tmp_path):

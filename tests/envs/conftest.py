@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 import pytest
-from env_data import NUM_WORLDS, POINT_GOAL_1, Compiled, compile_env, load
+from env_data import NUM_WORLDS, Compiled, compile_env, load
 
-from autocost_jax.config import EnvConfig
+from autocost_jax.env_config import EnvConfig, env_config
 from autocost_jax.records import EnvState
 
 
@@ -16,7 +16,8 @@ def default_env() -> Compiled:
 
 @pytest.fixture(scope="session")
 def point_goal_1() -> Compiled:
-    return compile_env(POINT_GOAL_1)
+    """Safety Gym's own PointGoal1, with its vase."""
+    return compile_env(env_config("PointGoal1"))
 
 
 @pytest.fixture(scope="session")

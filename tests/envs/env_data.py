@@ -2,33 +2,22 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.config import EnvConfig
+from autocost_jax.env_config import EnvConfig
 from autocost_jax.envs.env import Env, make_env
 from autocost_jax.records import EnvState, Layout
 
 DATA = Path(__file__).parents[1] / "data"
 NUM_WORLDS = 200  # one batch size for all tests, so that each function compiles once
 
-# Safety Gym's own PointGoal1, less its vase.
-POINT_GOAL_1 = EnvConfig(
-    placements_extents=(-1.5, -1.5, 1.5, 1.5),
-    goal_keepout=0.305,
-    hazards_size=0.2,
-    hazards_keepout=0.18,
-    constrain_indicator=True,
-    lidar_num_bins=16,
-    lidar_max_dist=3.0,
-)
-
 
 class Compiled(NamedTuple):
-    """An environment with its functions jitted over `NUM_WORLDS` worlds."""
+    """An environment with its functions jitted over a batch of worlds."""
 
     env: Env
     reset: Callable[[jax.Array], EnvState]
@@ -60,3 +49,46 @@ def compile_env(config: EnvConfig) -> Compiled:
         return step(state, jnp.asarray(action, state.obs.dtype))
 
     return Compiled(env, reset, reset_to, strong_step)
+
+
+def blank_layout(config: EnvConfig, **known: Any) -> Layout:
+    """A layout with everything at the origin but what is given."""
+    fields = {
+        "robot_xy": np.zeros(2),
+        "robot_yaw": np.zeros(()),
+        "goal_xy": np.zeros(2),
+        "hazards": np.zeros((config.hazards_num, 2)),
+        "pillars": np.zeros((config.pillars_num, 2)),
+        "box_xy": np.zeros(2),
+        "box_yaw": np.zeros(()),
+        "vases": np.zeros((config.vases_num, 2)),
+        "vases_yaw": np.zeros(config.vases_num),
+    }
+    return Layout(**{name: np.asarray(x) for name, x in (fields | known).items()})
+
+
+def stack(tree: Any, num: int) -> Any:
+    """`num` copies on a new leading axis."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (num, *jnp.shape(x))), tree)
+
+
+def states_at(env: Env, layout: Layout, qpos: Any, qvel: Any) -> EnvState:
+    """States [T] whose physics is `qpos` [T, nq] and `qvel` [T, nv].
+
+    Nothing is evaluated, so that only `step` has to be compiled: what a step does not
+    read is zero. The next rewards start from the robot's distance to the goal.
+    """
+    state: Any = jax.eval_shape(env.reset_to, layout, jax.random.key(0))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.replace(key=None))
+    num, dtype = len(qpos), state.obs.dtype
+    states = stack(zeros, num)
+    layouts = stack(jax.tree.map(lambda x: jnp.asarray(x, dtype), layout), num)
+    distance = np.linalg.norm(np.asarray(qpos)[:, :2] - layout.goal_xy, axis=-1)
+    return states.replace(
+        data=states.data.replace(
+            qpos=jnp.asarray(qpos, dtype), qvel=jnp.asarray(qvel, dtype)
+        ),
+        layout=layouts,
+        task_distances=jnp.asarray(distance[:, None], dtype),
+        key=jax.random.split(jax.random.key(0), num),
+    )

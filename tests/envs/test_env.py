@@ -1,20 +1,13 @@
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env_data import NUM_WORLDS, POINT_GOAL_1, float32_bound, load
+from env_data import NUM_WORLDS
 
-from autocost_jax.config import EnvConfig
-from autocost_jax.envs.constraints import hazard_constraint
+from autocost_jax.env_config import ENVS, SUITE, EnvConfig
 from autocost_jax.envs.env import list_envs, make_env
-from autocost_jax.envs.sensors import lidar
-from autocost_jax.records import Layout
 
-FLOAT32 = 1e-5  # float32 against the engine's float64
-# Sensors after one step inherit the servo's amplified rounding; see test_world.py.
-ACCELEROMETER_PER_YAW_RATE = 70.0
+FLOAT32 = 1e-5
 REWARD_ROUNDING = 1e-6
 
 
@@ -31,9 +24,11 @@ def numbers(state):
 
 
 def test_names():
-    assert list_envs() == ["Goal-Hazard-Point"]
-    with pytest.raises(ValueError, match="known: Goal-Hazard-Point"):
+    assert list_envs() == list(ENVS)
+    with pytest.raises(ValueError, match="'Goal-Hazard-Plane'") as caught:
         make_env("Goal-Hazard-Plane")
+    for name in (*ENVS, *SUITE):
+        assert name in str(caught.value)
 
 
 def test_static_facts(default_env):
@@ -50,21 +45,6 @@ def test_static_facts(default_env):
         "velocimeter": slice(25, 28),
     }
     assert env.config == EnvConfig()
-
-
-def test_default_world_table():
-    """Design 5: the numbers that neither the paper nor Safety Gym settles."""
-    config = EnvConfig()
-    assert config.placements_extents == (-2, -2, 2, 2)
-    assert (config.hazards_num, config.hazards_size, config.hazards_keepout) == (
-        8,
-        0.3,
-        0.4,
-    )
-    assert (config.goal_size, config.goal_keepout) == (0.3, 0.4)
-    assert (config.lidar_num_bins, config.lidar_max_dist) == (8, None)
-    assert config.lidar_exp_gain == 1.0
-    assert not config.constrain_indicator
 
 
 @pytest.mark.parametrize("x64", [False, True])
@@ -167,6 +147,11 @@ def test_dense_cost_inside_a_hazard(default_env, worlds):
     np.testing.assert_array_equal(after.cost_inputs.cost, after.cost)
 
 
+def test_default_cost_lidar_is_the_observed_one(default_env, worlds):
+    seen = worlds.obs[:, default_env.env.obs_slices["hazards_lidar"]]
+    np.testing.assert_array_equal(seen, worlds.cost_inputs.constraint_lidar)
+
+
 # --- goals --------------------------------------------------------------------------
 
 
@@ -246,122 +231,3 @@ def test_impossible_layout_starts_failed(monkeypatch):
     state = jax.jit(env.reset)(jax.random.key(0))
     assert bool(state.failed)
     assert not np.asarray(state.obs).any()
-
-
-# --- Safety Gym's own PointGoal1 ------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def stock():
-    """PointGoal1 as recorded, its states turned into world coordinates."""
-    recorded = load("env_PointGoal1_s1")
-    names = recorded["layout_names"].tolist()
-    robot = names.index("robot")
-    w, _, _, z = recorded["layout_quat"][robot]
-    yaw = 2 * np.arctan2(z, w)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    xy = recorded["layout_pos"][robot, :2] + recorded["qpos"][:, :2] @ turn.T
-    heading = yaw + recorded["qpos"][:, 2:3]
-    recorded["world_qpos"] = np.concatenate([xy, heading], -1)
-    velocity = recorded["qvel"][:, :2] @ turn.T
-    recorded["world_qvel"] = np.concatenate([velocity, recorded["qvel"][:, 2:3]], -1)
-    hazards = [i for i, name in enumerate(names) if name.startswith("hazard")]
-    recorded["hazards"] = recorded["layout_pos"][hazards, :2]
-    recorded["goal"] = recorded["layout_pos"][names.index("goal"), :2]
-    starts = [0, *np.cumsum(recorded["obs_sizes"])]
-    for name, a, b in zip(recorded["obs_keys"], starts, starts[1:], strict=False):
-        recorded[f"obs_{name}"] = recorded["obs"][:, a:b]
-    return recorded
-
-
-@pytest.fixture(scope="module")
-def stock_states(point_goal_1, stock):
-    """Our environment placed in the first 200 recorded states."""
-
-    def repeat(value):
-        value = jnp.asarray(value, jnp.float32)
-        return jnp.broadcast_to(value, (NUM_WORLDS, *value.shape))
-
-    qpos = jnp.asarray(stock["world_qpos"][:-1], jnp.float32)
-    layout = Layout(
-        robot_xy=qpos[:, :2],
-        robot_yaw=qpos[:, 2],
-        goal_xy=repeat(stock["goal"]),
-        hazards=repeat(stock["hazards"]),
-        pillars=repeat(np.zeros((0, 2))),
-        box_xy=repeat(np.zeros(2)),
-        box_yaw=repeat(0.0),
-    )
-    keys = jax.random.split(jax.random.key(0), NUM_WORLDS)
-    state = point_goal_1.reset_to(layout, keys)
-    qvel = jnp.asarray(stock["world_qvel"][:-1], jnp.float32)
-    return state.replace(data=state.data.replace(qvel=qvel))
-
-
-def test_point_goal_1_reset_to_matches(point_goal_1, stock, stock_states):
-    assert point_goal_1.env.observation_size == 44
-    distance = np.linalg.norm(
-        stock["hazards"] - stock["world_qpos"][:-1, None, :2], axis=-1
-    ).min(-1)
-    for name, bound in [
-        ("hazards_lidar", float32_bound(distance)[:, None]),
-        ("goal_lidar", FLOAT32),
-        ("magnetometer", FLOAT32),
-    ]:
-        got = stock_states.obs[:, point_goal_1.env.obs_slices[name]]
-        assert (np.abs(got - stock[f"obs_{name}"][:-1]) <= bound).all(), name
-
-
-def test_point_goal_1_steps_match(point_goal_1, stock, stock_states):
-    assert len(stock["actions"]) == NUM_WORLDS
-    assert not stock["goal_met"].any()
-    after = point_goal_1.step(stock_states, jnp.asarray(stock["actions"], jnp.float32))
-    np.testing.assert_allclose(after.reward, stock["reward"], atol=FLOAT32)
-    np.testing.assert_allclose(after.cost, stock["costs"][:, 0], atol=FLOAT32)
-    assert stock["costs"][:, 0].any()
-    yaw_rate = np.abs(after.data.qvel - stock["world_qvel"][1:])[:, 2, None]
-    yaw = np.abs(after.data.qpos - stock["world_qpos"][1:])[:, 2, None]
-    assert yaw.max() < 1e-4
-    assert yaw_rate.max() < 0.1  # design 6
-    bins_per_radian = 16 / (2 * np.pi)
-    distance = np.linalg.norm(
-        stock["hazards"] - stock["world_qpos"][1:, None, :2], axis=-1
-    ).min(-1)
-    bounds = {
-        "accelerometer": 1e-2 + ACCELEROMETER_PER_YAW_RATE * yaw_rate,
-        "gyro": FLOAT32 + yaw_rate,
-        "velocimeter": FLOAT32 + 0.05 * yaw_rate + 2 * yaw,
-        "magnetometer": FLOAT32 + yaw,
-        "goal_lidar": FLOAT32 + bins_per_radian * yaw,
-        "hazards_lidar": float32_bound(distance)[:, None] + bins_per_radian * yaw,
-    }
-    assert sorted(bounds) == list(point_goal_1.env.obs_slices)
-    for name, bound in bounds.items():
-        got = after.obs[:, point_goal_1.env.obs_slices[name]]
-        error = np.abs(got - stock[f"obs_{name}"][1:])
-        assert (error <= bound).all(), (name, error.max())
-
-
-def test_separate_cost_lidar(point_goal_1, stock, stock_states):
-    """The intrinsic network reads 8 exponential bins whatever the robot observes."""
-    hazards = jnp.asarray(stock["hazards"], jnp.float32)
-    expected = jax.vmap(
-        lambda position, rotation: lidar(hazards, position, rotation, num_bins=8)
-    )(stock_states.data.xpos[:, 1], stock_states.data.xmat[:, 1])
-    got = stock_states.cost_inputs.constraint_lidar
-    np.testing.assert_allclose(got, expected, atol=FLOAT32)
-    assert got.shape == (NUM_WORLDS, 8)
-
-
-def test_default_cost_lidar_is_the_observed_one(default_env, worlds):
-    seen = worlds.obs[:, default_env.env.obs_slices["hazards_lidar"]]
-    np.testing.assert_array_equal(seen, worlds.cost_inputs.constraint_lidar)
-
-
-def test_indicator_is_zero_or_one():
-    cost = hazard_constraint(POINT_GOAL_1).cost
-    assert float(cost(jnp.array([0.199, 1.0]))) == 1.0
-    assert float(cost(jnp.array([0.2, 1.0]))) == 0.0
-    scaled = dataclasses.replace(EnvConfig(), hazards_cost=2.0)
-    dense = hazard_constraint(scaled).cost(jnp.array([0.1, 0.2]))
-    assert float(dense) == pytest.approx(0.6)

@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import mujoco as untyped_mujoco
 import numpy as np
 import pytest
-from env_data import NUM_WORLDS, load
+from env_data import NUM_WORLDS, blank_layout, load
 
-from autocost_jax.config import EnvConfig
-from autocost_jax.envs.world import load_spec, make_world
+from autocost_jax.env_config import EnvConfig
+from autocost_jax.envs.models import load_spec
+from autocost_jax.envs.world import make_world
 
 mujoco: Any = untyped_mujoco  # its compiled names have no stubs
 
@@ -174,13 +175,14 @@ def test_one_substep_matches_closed_form_and_goldens():
     v = np.concatenate([[g[1] for g in golden], rng.uniform(-2, 2, (num, 3))])
     action = np.concatenate([[g[2] for g in golden], rng.uniform(-1.2, 1.2, (num, 2))])
     with jax.enable_x64(True):
-        world = make_world(EnvConfig(frameskip_binom_n=1))
-        rest = jax.tree.map(jnp.asarray, world.rest)
+        config = EnvConfig(frameskip_binom_n=1)
+        world, layout = make_world(config), blank_layout(config)
 
         @jax.jit
         @jax.vmap
         def step(q, v, action):
-            data = world.control_step(rest.replace(qpos=q, qvel=v), action)
+            start = world.place(layout).replace(qpos=q, qvel=v)
+            data = world.control_step(start, layout, action)
             return data.qpos, data.qvel, world.sensors(data)
 
         got_q, got_v, sensors = jax.device_get(step(q, v, action))
