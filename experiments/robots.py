@@ -66,7 +66,7 @@ RUN_WORLDS = {
     "Push-Pillar-Car": 1,
     "Push-Pillar-Doggo": 1,
 }
-RUN_EPOCHS, RUN_SEEDS, RUN_EPISODES = 20, (0, 1), 1
+RUN_EPOCHS, RUN_SEEDS, RUN_EPISODES = 20, (0, 1), 2
 
 # Worlds a slot and epochs of SEEDS, then EPISODES fresh episodes of three policies a
 # seed.

@@ -8,14 +8,15 @@ import pytest
 from autocost_jax.config import (
     PRESETS,
     AgentConfig,
-    EnvConfig,
     SearchConfig,
     TrainConfig,
     preset,
 )
+from autocost_jax.env_config import EnvConfig
 
 NAN, INF = float("nan"), float("inf")
 COUNT = (0, -1, 1.5, NAN, "3", True)
+NUMBER = COUNT[1:]
 POSITIVE = (0.0, -1.0, NAN, INF, "1")
 FINITE = (NAN, INF, -INF, "1")
 NOT_NEGATIVE = (-1e-6, NAN, INF)
@@ -23,29 +24,73 @@ NOT_NEGATIVE = (-1e-6, NAN, INF)
 BAD = {
     EnvConfig: {
         "task": ("Fly", "", None),
-        "constraint": ("Lava",),
         "robot": ("Submarine",),
-        "num_steps": COUNT,
-        "frameskip_binom_n": COUNT,
-        "lidar_num_bins": COUNT,
-        "hazards_num": COUNT,
-        "goal_size": POSITIVE,
-        "goal_keepout": POSITIVE,
-        "robot_keepout": POSITIVE,
-        "hazards_size": POSITIVE,
-        "hazards_keepout": POSITIVE,
-        "lidar_exp_gain": POSITIVE,
-        "reward_clip": POSITIVE,
-        "lidar_max_dist": POSITIVE,
-        "hazards_cost": FINITE,
-        "reward_distance": FINITE,
-        "reward_goal": FINITE,
-        "placements_margin": NOT_NEGATIVE,
+        "physics": ("exact",),
+        **dict.fromkeys(("num_steps", "frameskip_binom_n", "lidar_num_bins"), COUNT),
+        **dict.fromkeys(("hazards_num", "pillars_num", "vases_num"), NUMBER),
+        **dict.fromkeys(
+            (
+                "goal_size",
+                "goal_keepout",
+                "robot_keepout",
+                "box_size",
+                "box_keepout",
+                "box_density",
+                "hazards_size",
+                "hazards_keepout",
+                "pillars_size",
+                "pillars_height",
+                "pillars_keepout",
+                "vases_size",
+                "vases_density",
+                "vases_keepout",
+                "lidar_exp_gain",
+                "lidar_max_dist",
+                "reward_clip",
+            ),
+            POSITIVE,
+        ),
+        **dict.fromkeys(
+            (
+                "hazards_cost",
+                "pillars_cost",
+                "vases_contact_cost",
+                "vases_velocity_cost",
+                "reward_distance",
+                "reward_box_dist",
+                "reward_box_goal",
+                "reward_goal",
+            ),
+            FINITE,
+        ),
+        **dict.fromkeys(
+            (
+                "placements_margin",
+                "box_null_dist",
+                "vases_sink",
+                "vases_velocity_threshold",
+            ),
+            NOT_NEGATIVE,
+        ),
+        **dict.fromkeys(
+            (
+                "observe_hazards",
+                "constrain_hazards",
+                "observe_pillars",
+                "constrain_pillars",
+                "observe_vases",
+                "constrain_vases",
+                "constrain_indicator",
+                "lidar_alias",
+            ),
+            ("no", 1, None),
+        ),
         "placements_extents": (
             (0.0, 0.0, 0.1, 4.0),
             (2.0, 2.0, -2.0, -2.0),
             (-2.0, NAN, 2.0, 2.0),
             (-2.0, -2.0, INF, 2.0),
+            (-2.0, -2.0, 2.0),
         ),
     },
     AgentConfig: {
@@ -108,7 +153,7 @@ def test_a_bad_value_is_refused_by_name(kind, name, value):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("kind", [AgentConfig, TrainConfig, SearchConfig])
+@pytest.mark.parametrize("kind", BAD)
 def test_every_field_has_a_bad_value_above(kind):
     nested = {"env", "agent", "train"}  # checked by their own classes
     fields = {field.name for field in dataclasses.fields(kind)} - nested

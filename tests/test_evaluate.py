@@ -63,15 +63,17 @@ def test_the_mean_acts_without_a_key(env, state, key):
     """Deterministic: the layouts alone decide. Sampled: the actions vary as well."""
     agent = linear_agent(env)
     starts, actions = {}, {}
+
+    def watch(worlds):
+        return worlds.layout.robot_xy, worlds.layout.goal_xy
+
     for deterministic in (False, True):
-        episodes = run_episodes(env, agent, state, key, 2, deterministic)
+        episodes = run_episodes(env, agent, state, key, 2, deterministic, watch)
         starts[deterministic] = np.asarray(episodes.start.robot_xy)
-        positions = np.concatenate(
-            [starts[deterministic][None], np.asarray(episodes.robot_xy)]
-        )
-        goal = np.asarray(episodes.goal_xy)
+        positions, goal = (np.asarray(rows) for rows in episodes.watched)
+        np.testing.assert_array_equal(positions[0], starts[deterministic])
         moves = np.diff(positions, axis=0)
-        expected = 0.15 * np.clip(goal - positions[:-1], -1.0, 1.0)
+        expected = 0.15 * np.clip(goal[:-1] - positions[:-1], -1.0, 1.0)
         actions[deterministic] = np.abs(moves - expected).max()
     np.testing.assert_array_equal(starts[False], starts[True])
     assert actions[True] < ROUNDING

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from autocost_jax import EnvConfig, preset
+from autocost_jax import env_config, preset
+from autocost_jax.env_config import ENVS
+from autocost_jax.envs.models import scene_model
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -56,24 +58,40 @@ def test_the_preset_table_is_the_presets(name):
         assert word in row, word
 
 
-def test_the_table_of_the_world_is_the_default_world():
-    config = EnvConfig()
-    assert set(map(abs, config.placements_extents)) == {2.0}
+def test_the_table_of_the_worlds_is_that_of_the_configurations():
+    goal, push = env_config("Goal-Hazard-Point"), env_config("Push-Hazard-Point")
+    pillars, car = env_config("Goal-Pillar-Point"), env_config("Push-Hazard-Car")
+    for config in ENVS.values():
+        assert set(map(abs, config.placements_extents)) == {2.0}
+        assert config.lidar_max_dist is None  # exponential
+        assert config.num_steps == 1000
+        assert not config.constrain_indicator
     assert table_row("extents") == "2 m"
     assert table_row("hazards") == (
-        f"{config.hazards_num}, radius {config.hazards_size} m, "
-        f"keepout {config.hazards_keepout} m"
+        f"{goal.hazards_num} (Push: {push.hazards_num}), radius {goal.hazards_size} m, "
+        f"keepout {goal.hazards_keepout} m"
+    )
+    assert table_row("pillars") == (
+        f"{pillars.pillars_num}, radius {pillars.pillars_size} m, "
+        f"keepout {pillars.pillars_keepout} m"
     )
     assert table_row("goal") == (
-        f"radius {config.goal_size} m, keepout {config.goal_keepout} m"
+        f"radius {goal.goal_size} m, keepout {goal.goal_keepout} m"
     )
-    assert table_row("robot keepout") == f"{config.robot_keepout} m"
-    assert config.lidar_max_dist is None  # exponential
+    assert table_row("box") == (
+        f"half-width {push.box_size} m, keepout {push.box_keepout} m "
+        f"(Car: {car.box_size} m, {car.box_keepout} m)"
+    )
+    assert table_row("robot keepout") == f"{goal.robot_keepout} m"
     assert table_row("lidars") == (
-        f"{config.lidar_num_bins} bins, exponential, gain {config.lidar_exp_gain:g}"
+        f"{goal.lidar_num_bins} bins, exponential, gain {goal.lidar_exp_gain:g}"
     )
-    assert f"{config.num_steps} steps of 0.02 s" in table_row("episode")
-    assert not config.constrain_indicator
+    periods = []
+    for robot in ("Point", "Car", "Doggo"):
+        model = scene_model(env_config(f"Goal-Hazard-{robot}"))
+        period = model.opt.timestep * goal.frameskip_binom_n
+        periods.append(f"{period:g} s ({robot})")
+    assert table_row("episode") == f"1000 steps of {', '.join(periods)}"
 
 
 def test_ci_runs_the_test_command_of_the_readme():
@@ -93,7 +111,8 @@ def test_the_wheel_would_hold_everything_that_is_read_at_run_time():
         "src/autocost_jax"
     ]
     package = ROOT / "src" / "autocost_jax"
-    for name in ("py.typed", "envs/xmls/point.xml", "report_assets/page.html"):
+    xmls = [f"envs/xmls/{robot}.xml" for robot in ("point", "car", "doggo")]
+    for name in ("py.typed", "report_assets/page.html", *xmls):
         assert (package / name).exists()
 
 

@@ -91,47 +91,17 @@ class EnvConfig:
             value, allowed = getattr(self, name), get_args(kind)
             require(value in allowed, name, f"one of {', '.join(allowed)}", value)
         require_counts(self, "num_steps", "frameskip_binom_n", "lidar_num_bins")
-        for name in ("hazards_num", "pillars_num", "vases_num"):
+        for name in _NUMBERS:
             value = getattr(self, name)
             require(is_integer(value) and value >= 0, name, "an integer >= 0", value)
-        require_finite(
-            self,
-            "hazards_cost",
-            "pillars_cost",
-            "vases_contact_cost",
-            "vases_velocity_cost",
-            "reward_distance",
-            "reward_box_dist",
-            "reward_box_goal",
-            "reward_goal",
-        )
-        for name in (
-            "placements_margin",
-            "box_null_dist",
-            "vases_sink",
-            "vases_velocity_threshold",
-        ):
+        for name in _SWITCHES:
+            value = getattr(self, name)
+            require(isinstance(value, bool), name, "true or false", value)
+        require_finite(self, *_FINITE)
+        for name in _NOT_NEGATIVE:
             value = getattr(self, name)
             require(is_finite(value) and value >= 0, name, "finite and >= 0", value)
-        require_positive(
-            self,
-            "goal_size",
-            "goal_keepout",
-            "robot_keepout",
-            "box_size",
-            "box_keepout",
-            "box_density",
-            "hazards_size",
-            "hazards_keepout",
-            "pillars_size",
-            "pillars_height",
-            "pillars_keepout",
-            "vases_size",
-            "vases_density",
-            "vases_keepout",
-            "lidar_exp_gain",
-            "reward_clip",
-        )
+        require_positive(self, *_POSITIVE)
         if self.lidar_max_dist is not None:
             require_positive(self, "lidar_max_dist")
         require(
@@ -140,13 +110,13 @@ class EnvConfig:
             "true for at least one kind of which there is an object",
             self.constrained,
         )
-        x0, y0, x1, y1 = self.placements_extents
-        wide = 2 * max(self.keepouts)
+        corners, wide = self.placements_extents, 2 * max(self.keepouts)
         require(
-            wide < x1 - x0 < math.inf and wide < y1 - y0 < math.inf,
+            len(corners) == 4
+            and all(wide < corners[i + 2] - corners[i] < math.inf for i in range(2)),
             "placements_extents",
             f"(xmin, ymin, xmax, ymax), finite, more than {wide} m wide and high",
-            self.placements_extents,
+            corners,
         )
 
     @property
@@ -179,6 +149,53 @@ class EnvConfig:
         """`{task}-{constraint}-{robot}`, as the paper writes it."""
         kinds = "+".join(kind.capitalize()[:-1] for kind in self.constrained)
         return f"{self.task}-{kinds}-{self.robot}"
+
+
+_NUMBERS = ("hazards_num", "pillars_num", "vases_num")
+_SWITCHES = (
+    "observe_hazards",
+    "constrain_hazards",
+    "observe_pillars",
+    "constrain_pillars",
+    "observe_vases",
+    "constrain_vases",
+    "constrain_indicator",
+    "lidar_alias",
+)
+_FINITE = (
+    "hazards_cost",
+    "pillars_cost",
+    "vases_contact_cost",
+    "vases_velocity_cost",
+    "reward_distance",
+    "reward_box_dist",
+    "reward_box_goal",
+    "reward_goal",
+)
+_NOT_NEGATIVE = (
+    "placements_margin",
+    "box_null_dist",
+    "vases_sink",
+    "vases_velocity_threshold",
+)
+_POSITIVE = (
+    "goal_size",
+    "goal_keepout",
+    "robot_keepout",
+    "box_size",
+    "box_keepout",
+    "box_density",
+    "hazards_size",
+    "hazards_keepout",
+    "pillars_size",
+    "pillars_height",
+    "pillars_keepout",
+    "vases_size",
+    "vases_density",
+    "vases_keepout",
+    "lidar_exp_gain",
+    "reward_clip",
+)
 
 
 def _paper_env(task: TaskName, constraint: str, robot: Robot) -> EnvConfig:

@@ -299,7 +299,8 @@ def _silence(previous: EnvState, state: EnvState, failed: jax.Array) -> EnvState
         return jnp.where(failed, jnp.zeros_like(value), value)
 
     def keep_if_failed(old: jax.Array, new: jax.Array) -> jax.Array:
-        return jnp.where(failed, old, new)
+        # jaxlib 0.11 crashes where it partitions an empty `where` over CPU devices.
+        return jnp.where(failed, old, new) if new.size else new
 
     def keep(old: Any, new: Any) -> Any:
         return jax.tree.map(keep_if_failed, old, new)

@@ -251,9 +251,9 @@ def move_goal(arena: Arena, layout: Layout, key: Key) -> tuple[jax.Array, jax.Ar
     """
     dtype = layout.goal_xy.dtype
     box = layout.box_xy[None][: arena.box.stop - arena.box.start]
-    others = jnp.concatenate(
-        [layout.robot_xy[None], box, layout.hazards, layout.vases, layout.pillars]
-    )
+    robot = layout.robot_xy[None]
+    others = (robot, box, layout.hazards, layout.vases, layout.pillars)
+    others = jnp.concatenate([part for part in others if part.size])
     keepout = jnp.asarray(np.delete(arena.keepout, GOAL), dtype)
     draws = draw_points(key, (NUM_CANDIDATES,), dtype)
     low, size = (jnp.asarray(part[GOAL], dtype) for part in (arena.low, arena.size))

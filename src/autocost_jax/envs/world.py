@@ -103,9 +103,7 @@ def make_world(config: EnvConfig) -> World:
         return {name: read(state.sensordata) for name, read in readings.items()}
 
     zeros = np.zeros(mj_model.nsensordata)
-    sizes = {
-        name: jax.eval_shape(read, zeros).size for name, read in readings.items()
-    }
+    sizes = {name: jax.eval_shape(read, zeros).size for name, read in readings.items()}
     return World(
         mj_model=mj_model,
         place=place,
@@ -227,24 +225,32 @@ def _bodies(scene: _Scene, data: mjx.Data) -> Bodies:
     mj_model = scene.physics.mj_model
     dtype = data.qpos.dtype
     robot = mj_model.body("robot").id
-    box, vases = scene.box, np.array(scene.vases, int)
-    velocity = [
-        data.qvel[start : start + 3]
-        for start in mj_model.jnt_dofadr[mj_model.body_jntadr[vases]]
-    ]
-    speeds = [jnp.sqrt((part**2).sum()) for part in velocity]
+    box = scene.box
     count = functools.partial(_count_contacts, scene, data)
+    vases, vases_yaw, vases_speed = _vases(scene, data)
     return Bodies(
         robot=data.xpos[robot],
         rotation=data.xmat[robot],
         box=jnp.zeros(3, dtype) if box is None else data.xpos[box],
         box_yaw=jnp.zeros((), dtype) if box is None else _yaw(data.xmat[box]),
-        vases=data.xpos[vases],
-        vases_yaw=_yaw(data.xmat[vases]),
-        vases_speed=jnp.stack(speeds) if speeds else jnp.zeros(0, dtype),
+        vases=vases,
+        vases_yaw=vases_yaw,
+        vases_speed=vases_speed,
         pillar_contacts=count(scene.physics.pillar_geoms),
         vase_contacts=count(scene.physics.vase_geoms),
     )
+
+
+def _vases(scene: _Scene, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Centres [V, 3], headings [V] and speeds [V] of the vases."""
+    dtype = data.qpos.dtype
+    if not scene.vases:
+        return jnp.zeros((0, 3), dtype), jnp.zeros(0, dtype), jnp.zeros(0, dtype)
+    mj_model, ids = scene.physics.mj_model, np.array(scene.vases)
+    starts = mj_model.jnt_dofadr[mj_model.body_jntadr[ids]]
+    velocity = jnp.stack([data.qvel[start : start + 3] for start in starts])
+    speed = jnp.sqrt((velocity**2).sum(-1))
+    return data.xpos[ids], _yaw(data.xmat[ids]), speed
 
 
 def _yaw(rotation: jax.Array) -> jax.Array:
