@@ -14,7 +14,6 @@ Lengths are metres, angles radians, times seconds.
 from typing import Any
 
 import jax
-import numpy as np
 from flax import struct
 
 Key = jax.Array
@@ -32,8 +31,9 @@ class Layout(struct.PyTreeNode):
       pillars: [Q, 2] pillar centres.
       box_xy: [2] box centre; zeros where the task has no box.
       box_yaw: [] heading of the box; zero where the task has no box.
-      vases: [V, 2] vase centres; only Safety Gym's own suite has vases.
-      vases_yaw: [V] headings of the vases.
+      vases: [V, 2] vase centres; None without vases, which only Safety Gym's own
+        suite has.
+      vases_yaw: [V] headings of the vases; None without.
     """
 
     robot_xy: jax.Array
@@ -43,8 +43,8 @@ class Layout(struct.PyTreeNode):
     pillars: jax.Array
     box_xy: jax.Array
     box_yaw: jax.Array
-    vases: jax.Array = struct.field(default_factory=lambda: np.zeros((0, 2), "f4"))
-    vases_yaw: jax.Array = struct.field(default_factory=lambda: np.zeros(0, "f4"))
+    vases: jax.Array | None = None
+    vases_yaw: jax.Array | None = None
 
 
 class Bodies(struct.PyTreeNode):
@@ -55,22 +55,22 @@ class Bodies(struct.PyTreeNode):
       rotation: [3, 3] robot body to world.
       box: [3] centre of the box; zeros where the task has no box.
       box_yaw: [] heading of the box.
-      vases: [V, 3] vase centres.
-      vases_yaw: [V] headings of the vases.
-      vases_speed: [V] speeds of the vases' centres, m/s.
       pillar_contacts: [] int32 contact points between robot and pillars.
       vase_contacts: [] int32 contact points between robot and vases.
+      vases: [V, 3] vase centres; None without vases.
+      vases_yaw: [V] headings of the vases; None without.
+      vases_speed: [V] speeds of the vases' centres, m/s; None without.
     """
 
     robot: jax.Array
     rotation: jax.Array
     box: jax.Array
     box_yaw: jax.Array
-    vases: jax.Array
-    vases_yaw: jax.Array
-    vases_speed: jax.Array
     pillar_contacts: jax.Array
     vase_contacts: jax.Array
+    vases: jax.Array | None = None
+    vases_yaw: jax.Array | None = None
+    vases_speed: jax.Array | None = None
 
 
 class PhysicsState(struct.PyTreeNode):

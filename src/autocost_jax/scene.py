@@ -138,8 +138,9 @@ def at_rest(scene: Scene, layout: Layout) -> Recording:
     put("robot", layout.robot_xy, layout.robot_yaw)
     if scene.config.task == "Push":
         put("box", layout.box_xy, layout.box_yaw)
-    for i in range(scene.config.vases_num):
-        put(f"vase{i}", layout.vases[i], layout.vases_yaw[i])
+    if layout.vases is not None and layout.vases_yaw is not None:
+        for i in range(scene.config.vases_num):
+            put(f"vase{i}", layout.vases[i], layout.vases_yaw[i])
     return Recording(
         qpos=qpos[None],
         goal_xy=np.asarray(layout.goal_xy)[None],

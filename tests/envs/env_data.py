@@ -64,7 +64,10 @@ def blank_layout(config: EnvConfig, **known: Any) -> Layout:
         "vases": np.zeros((config.vases_num, 2)),
         "vases_yaw": np.zeros(config.vases_num),
     }
-    return Layout(**{name: np.asarray(x) for name, x in (fields | known).items()})
+    arrays: dict[str, Any] = {
+        name: np.asarray(value) for name, value in (fields | known).items()
+    }
+    return Layout(**arrays)
 
 
 def stack(tree: Any, num: int) -> Any:

@@ -55,13 +55,17 @@ class Recording(NamedTuple):
         return np.linalg.norm(offset, axis=-1).min(-1)
 
 
+def _numpy_layout(**arrays: Any) -> Layout:
+    return Layout(**arrays)
+
+
 def read(robot: str) -> Recording:
     raw = load(f"env_{robot}Goal1_s1")
     names = raw["layout_names"].tolist()
     xy = {name: raw["layout_pos"][i, :2] for i, name in enumerate(names)}
     yaw = dict(zip(names, 2 * np.arctan2(*raw["layout_quat"].T[[3, 0]]), strict=True))
     hazards = [name for name in names if name.startswith("hazard")]
-    layout = Layout(
+    layout = _numpy_layout(
         robot_xy=xy["robot"],
         robot_yaw=yaw["robot"],
         goal_xy=xy["goal"],

@@ -107,13 +107,20 @@ def vase_constraint(config: EnvConfig) -> Constraint:
     """
 
     def cost(distances: jax.Array, bodies: Bodies) -> jax.Array:
-        speed = bodies.vases_speed
+        speed = _present(bodies.vases_speed)
         moving = jnp.where(speed >= config.vases_velocity_threshold, speed, 0.0).sum()
         touches = bodies.vase_contacts.astype(distances.dtype)
         return config.vases_contact_cost * touches + config.vases_velocity_cost * moving
 
     radii = np.full(config.vases_num, config.vases_size)
-    return Constraint(lambda layout: layout.vases, radii, cost)
+    return Constraint(lambda layout: _present(layout.vases), radii, cost)
+
+
+def _present(array: jax.Array | None) -> jax.Array:
+    """What only worlds with vases have."""
+    if array is None:
+        raise ValueError("there are no vases in this world")
+    return array
 
 
 _KINDS: dict[str, Callable[[EnvConfig], Constraint]] = {

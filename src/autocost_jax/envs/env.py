@@ -135,9 +135,11 @@ def _reset_to(parts: _Parts, layout: Layout, key: Key) -> EnvState:
         the configuration.
     """
     config = parts.config
+    if config.vases_num == 0:
+        layout = layout.replace(vases=None, vases_yaw=None)
     for kind in ("hazards", "vases", "pillars"):
-        chex.assert_shape(getattr(layout, kind), (getattr(config, f"{kind}_num"), 2))
-    chex.assert_shape(layout.vases_yaw, (config.vases_num,))
+        shape = (getattr(config, f"{kind}_num"), 2)
+        chex.assert_shape(_objects(layout, kind), shape)
     dtype = parts.world.dtype
     layout = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), layout)
     data = parts.world.place(layout)
@@ -246,10 +248,16 @@ def _update_layout(parts: _Parts, layout: Layout, bodies: Bodies) -> Layout:
     )
     if parts.config.task == "Push":
         layout = layout.replace(box_xy=bodies.box[:2], box_yaw=bodies.box_yaw)
-    if parts.config.vases_num:
+    if bodies.vases is not None:
         vases = bodies.vases[:, :2]
         layout = layout.replace(vases=vases, vases_yaw=bodies.vases_yaw)
     return layout
+
+
+def _objects(layout: Layout, kind: str) -> jax.Array:
+    """[M, 2] centres of a kind of object."""
+    positions = getattr(layout, kind)
+    return jnp.zeros((0, 2), layout.robot_xy.dtype) if positions is None else positions
 
 
 def _closest(constraint: Constraint, layout: Layout) -> tuple[jax.Array, jax.Array]:
@@ -278,7 +286,7 @@ def _observe(
         alias=config.lidar_alias,
     )
     obs = {name: see(targets(layout)) for name, targets in parts.task.lidars.items()}
-    obs |= {f"{kind}_lidar": see(getattr(layout, kind)) for kind in parts.observed}
+    obs |= {f"{kind}_lidar": see(_objects(layout, kind)) for kind in parts.observed}
     obs |= parts.world.sensors(data)
     # What the intrinsic cost reads does not depend on what the robot observes; where
     # the two are the same the compiler computes them once.

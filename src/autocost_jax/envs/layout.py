@@ -216,8 +216,8 @@ def sample_layout(arena: Arena, key: Key, dtype: Any) -> tuple[Layout, jax.Array
     draws = draw_points(key_draws, shape, dtype)
     placed, success = jax.vmap(functools.partial(place_all, arena))(draws)
     xy = placed[jnp.argmax(success)]
-    vases = xy[arena.vases]
-    yaws = jax.random.uniform(key_yaws, (1 + len(vases),), dtype, 0.0, 2 * np.pi)
+    num_vases = arena.vases.stop - arena.vases.start
+    yaws = jax.random.uniform(key_yaws, (1 + num_vases,), dtype, 0.0, 2 * np.pi)
     has_box = arena.box.stop > arena.box.start
     layout = Layout(
         robot_xy=xy[ROBOT],
@@ -227,8 +227,8 @@ def sample_layout(arena: Arena, key: Key, dtype: Any) -> tuple[Layout, jax.Array
         pillars=xy[arena.pillars],
         box_xy=xy[arena.box][0] if has_box else jnp.zeros(2, dtype),
         box_yaw=yaws[0] if has_box else jnp.zeros((), dtype),
-        vases=vases,
-        vases_yaw=yaws[1:],
+        vases=xy[arena.vases] if num_vases else None,
+        vases_yaw=yaws[1:] if num_vases else None,
     )
     return layout, ~success.any()
 
@@ -253,7 +253,7 @@ def move_goal(arena: Arena, layout: Layout, key: Key) -> tuple[jax.Array, jax.Ar
     box = layout.box_xy[None][: arena.box.stop - arena.box.start]
     robot = layout.robot_xy[None]
     others = (robot, box, layout.hazards, layout.vases, layout.pillars)
-    others = jnp.concatenate([part for part in others if part.size])
+    others = jnp.concatenate([x for x in others if x is not None and x.size])
     keepout = jnp.asarray(np.delete(arena.keepout, GOAL), dtype)
     draws = draw_points(key, (NUM_CANDIDATES,), dtype)
     low, size = (jnp.asarray(part[GOAL], dtype) for part in (arena.low, arena.size))

@@ -14,6 +14,8 @@ Source: MuJoCo documentation, Computation, "Primal problem"; engine_solver.c.
 Differs: a fixed number of iterations; no rows but inequalities, no elliptic cones.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from mujoco import mjx
@@ -32,7 +34,7 @@ def solve_constraints(model: mjx.Model, data: mjx.Data, iterations: int) -> mjx.
     Returns:
       data with `qacc` [nv], `qfrc_constraint` [nv] and `_impl.efc_force` [nefc].
     """
-    impl = data._impl
+    impl: Any = data._impl
     jacobian, stiffness = impl.efc_J, impl.efc_D
     mass = mjx.full_m(model, data)
 
@@ -52,7 +54,7 @@ def solve_constraints(model: mjx.Model, data: mjx.Data, iterations: int) -> mjx.
         hessian = mass + jnp.dot(jacobian.T * weight, jacobian, precision="highest")
         direction = -solve_positive(hessian, gradient)
         change = _mul(jacobian, direction)
-        slope, curvature = (gradient * direction).sum(), 0.0
+        slope = (gradient * direction).sum()
         slope -= (weight * distance * change).sum()  # of the mass term alone
         curvature = (_mul(mass, direction) * direction).sum()
         length = _line_search(slope, curvature, stiffness, distance, change)
@@ -65,13 +67,13 @@ def solve_constraints(model: mjx.Model, data: mjx.Data, iterations: int) -> mjx.
     )
     qacc = jax.lax.fori_loop(0, iterations, step, start)
     force = -stiffness * jnp.minimum(0.0, gap(qacc))
-    return data.tree_replace(
-        {
-            "qacc": qacc,
-            "qfrc_constraint": _mul(jacobian.T, force),
-            "_impl.efc_force": force,
-        }
-    )
+    solved: Any = {
+        "qacc": qacc,
+        "qfrc_constraint": _mul(jacobian.T, force),
+        "_impl.efc_force": force,
+    }
+    result: Any = data.tree_replace(solved)
+    return result
 
 
 def _mul(matrix: jax.Array, vector: jax.Array) -> jax.Array:

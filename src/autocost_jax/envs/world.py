@@ -5,7 +5,7 @@ functions of `PhysicsState`.
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -165,10 +165,16 @@ def _rest_qpos(scene: _Scene, layout: Layout) -> jax.Array:
     qpos = put(qpos, 0, layout.robot_xy, layout.robot_yaw)
     if scene.box is not None:
         qpos = put(qpos, _qpos_start(scene, scene.box), layout.box_xy, layout.box_yaw)
-    for i, vase in enumerate(scene.vases):
-        start = _qpos_start(scene, vase)
-        qpos = put(qpos, start, layout.vases[i], layout.vases_yaw[i])
+    for vase, xy, yaw in zip(scene.vases, *_vase_places(layout), strict=True):
+        qpos = put(qpos, _qpos_start(scene, vase), xy, yaw)
     return qpos
+
+
+def _vase_places(layout: Layout) -> tuple[Sequence[jax.Array], Sequence[jax.Array]]:
+    """Position [2] and heading [] of each vase."""
+    if layout.vases is None or layout.vases_yaw is None:
+        return (), ()
+    return list(layout.vases), list(layout.vases_yaw)
 
 
 def _qpos_start(scene: _Scene, body: int) -> int:
@@ -227,30 +233,27 @@ def _bodies(scene: _Scene, data: mjx.Data) -> Bodies:
     robot = mj_model.body("robot").id
     box = scene.box
     count = functools.partial(_count_contacts, scene, data)
-    vases, vases_yaw, vases_speed = _vases(scene, data)
     return Bodies(
         robot=data.xpos[robot],
         rotation=data.xmat[robot],
         box=jnp.zeros(3, dtype) if box is None else data.xpos[box],
         box_yaw=jnp.zeros((), dtype) if box is None else _yaw(data.xmat[box]),
-        vases=vases,
-        vases_yaw=vases_yaw,
-        vases_speed=vases_speed,
         pillar_contacts=count(scene.physics.pillar_geoms),
         vase_contacts=count(scene.physics.vase_geoms),
+        **_vases(scene, data),
     )
 
 
-def _vases(scene: _Scene, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Centres [V, 3], headings [V] and speeds [V] of the vases."""
-    dtype = data.qpos.dtype
+def _vases(scene: _Scene, data: mjx.Data) -> dict[str, jax.Array]:
+    """Centres [V, 3], headings [V] and speeds [V] of the vases, if there are any."""
     if not scene.vases:
-        return jnp.zeros((0, 3), dtype), jnp.zeros(0, dtype), jnp.zeros(0, dtype)
+        return {}
     mj_model, ids = scene.physics.mj_model, np.array(scene.vases)
     starts = mj_model.jnt_dofadr[mj_model.body_jntadr[ids]]
     velocity = jnp.stack([data.qvel[start : start + 3] for start in starts])
     speed = jnp.sqrt((velocity**2).sum(-1))
-    return data.xpos[ids], _yaw(data.xmat[ids]), speed
+    yaw = _yaw(data.xmat[ids])
+    return {"vases": data.xpos[ids], "vases_yaw": yaw, "vases_speed": speed}
 
 
 def _yaw(rotation: jax.Array) -> jax.Array:
@@ -351,4 +354,5 @@ def _align_frames(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     frame = jnp.stack([normal, along, jnp.cross(normal, along)], axis=1)
     lies &= length[:, 0] > 1e-6
     frame = jnp.where(lies[:, None, None], frame, contact.frame)
-    return data.tree_replace({"_impl.contact.frame": frame})
+    aligned: Any = data.tree_replace({"_impl.contact.frame": frame})
+    return aligned
