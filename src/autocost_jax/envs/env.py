@@ -257,7 +257,7 @@ def _update_layout(parts: _Parts, layout: Layout, bodies: Bodies) -> Layout:
 def _objects(layout: Layout, kind: str) -> jax.Array:
     """[M, 2] centres of a kind of object."""
     positions = getattr(layout, kind)
-    return jnp.zeros((0, 2), layout.robot_xy.dtype) if positions is None else positions
+    return jnp.zeros((0, 2)) if positions is None else positions
 
 
 def _closest(constraint: Constraint, layout: Layout) -> tuple[jax.Array, jax.Array]:
