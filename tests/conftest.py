@@ -31,7 +31,11 @@ def pytest_terminal_summary(
         "command": f"pytest -m {config.getoption('markexpr')!r} --results {file}",
         "facts": run_facts(),
         "tests": {
-            report.nodeid: {"outcome": report.outcome, "seconds": report.duration}
+            report.nodeid: {
+                "outcome": report.outcome,
+                "seconds": report.duration,
+                **dict(report.user_properties),  # what `record_property` was told
+            }
             for report in reports
         },
     }

@@ -39,13 +39,15 @@ NEAREST_TO_BOX = 2
 # Contacts that the solver sees, the deepest ones: on the floor (a wheel has two at a
 # time), with pillars, with a box or vase, and between that and floor or pillars.
 FLOOR_CONTACTS = {"Point": 0, "Car": 5, "Doggo": 8}
-PILLAR_CONTACTS, SOLID_CONTACTS = 4, 8
+PILLAR_CONTACTS = {"Point": 4, "Car": 6, "Doggo": 4}
+SOLID_CONTACTS = 8
 REDUCED_ITERATIONS = 8
 FULL_ITERATIONS = 20
 # Four corners carry the box in place of twenty; at 1.3 box_size its friction, turning
 # and tilt are on average those of the box with its posts.
 FOOT = 1.3
-# Where upright boxes meet a pillar: the Car's lower or upper edge, as it pitches.
+# Where upright boxes meet a pillar: the Car's lower or upper edge, as it pitches; the
+# deeper of the two contacts counts.
 BALL_HEIGHTS = {"Point": (0.1,), "Car": (0.05, 0.15), "Doggo": ()}
 
 
@@ -59,6 +61,8 @@ class PhysicsModel(NamedTuple):
       robot_geoms: [ngeom] bool, part of the robot.
       pillar_geoms: [ngeom] bool, part of a pillar.
       vase_geoms: [ngeom] bool, part of a vase.
+      choices: [ngeom] number of the body of which a geom is one of several: another
+        geom touches at most one of them at a time, the deepest. Else 0.
       has_contacts: whether anything can touch anything.
     """
 
@@ -68,6 +72,7 @@ class PhysicsModel(NamedTuple):
     robot_geoms: np.ndarray
     pillar_geoms: np.ndarray
     vase_geoms: np.ndarray
+    choices: np.ndarray
     has_contacts: bool
 
 
@@ -129,6 +134,9 @@ def _label(mj_model: Any, robot: list[str], has_contacts: bool) -> PhysicsModel:
     def starts(*prefixes: str) -> np.ndarray:
         return np.array([name.startswith(prefixes) for name in names], bool)
 
+    bodies = np.asarray(mj_model.geom_bodyid)
+    is_ball = np.array(["_ball" in name for name in names], bool) & starts("pillar")
+    num_balls = np.bincount(bodies[is_ball], minlength=mj_model.nbody)
     mocap = {
         mj_model.body(i).name: int(mj_model.body_mocapid[i])
         for i in range(mj_model.nbody)
@@ -141,6 +149,7 @@ def _label(mj_model: Any, robot: list[str], has_contacts: bool) -> PhysicsModel:
         robot_geoms=np.array([name in robot for name in names], bool),
         pillar_geoms=starts("pillar"),
         vase_geoms=starts("vase"),
+        choices=np.where(is_ball & (num_balls[bodies] > 1), bodies, 0),
         has_contacts=has_contacts,
     )
 
@@ -239,7 +248,7 @@ def _reduce(spec: Any, config: EnvConfig) -> list[str]:
     for i in range(min(NEAREST_TO_BOX, config.pillars_num) if parts else 0):
         _add_pillar_pairs(spec, config, f"stop{i}", parts, (config.box_size,))
     cap = FLOOR_CONTACTS[config.robot] + SOLID_CONTACTS * (bool(parts) + len(vases))
-    cap += PILLAR_CONTACTS if config.pillars_num else 0
+    cap += PILLAR_CONTACTS[config.robot] if config.pillars_num else 0
     spec.add_numeric(name="max_contact_points", data=[cap], size=1)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0

@@ -71,7 +71,9 @@ def make_world(config: EnvConfig) -> World:
         vases=tuple(mj_model.body(f"vase{i}").id for i in range(config.vases_num)),
     )
     num_substeps = config.frameskip_binom_n
-    substep = _contact_substep if physics.has_contacts else _free_substep
+    substep = functools.partial(_contact_substep, physics.choices)
+    if not physics.has_contacts:
+        substep = _free_substep
 
     def place(layout: Layout) -> PhysicsState:
         qpos = _rest_qpos(scene, layout)
@@ -212,7 +214,7 @@ def _observe(
     qpos, qvel, warmstart = moving
     data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
     if scene.physics.has_contacts:
-        data = _forward(model, data)
+        data = _forward(scene.physics.choices, model, data)
     else:
         data = mjx.sensor_acc(model, mjx.forward(model, data))
     return PhysicsState(
@@ -314,19 +316,22 @@ def _free_substep(model: mjx.Model, start: mjx.Data, moving: Moving) -> Moving:
     return data.qpos, data.qvel, warmstart
 
 
-def _contact_substep(model: mjx.Model, start: mjx.Data, moving: Moving) -> Moving:
+def _contact_substep(
+    choices: np.ndarray, model: mjx.Model, start: mjx.Data, moving: Moving
+) -> Moving:
     """One physics step with contacts; what is not carried on is never computed."""
     qpos, qvel, warmstart = moving
     data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-    data = mjx.euler(model, _forward(model, data))
+    data = mjx.euler(model, _forward(choices, model, data))
     return data.qpos, data.qvel, data.qacc_warmstart
 
 
-def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def _forward(choices: np.ndarray, model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.forward` with MuJoCo's contact frames and this package's solver."""
     data = mjx.com_pos(model, mjx.kinematics(model, data))
     data = mjx.factor_m(model, mjx.crb(model, data))
     data = _align_frames(model, mjx.collision(model, data))
+    data = _keep_deepest(choices, data) if choices.any() else data
     data = mjx.transmission(model, mjx.make_constraint(model, data))
     data = mjx.sensor_vel(model, mjx.fwd_velocity(model, mjx.sensor_pos(model, data)))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
@@ -356,3 +361,22 @@ def _align_frames(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     frame = jnp.where(lies[:, None, None], frame, contact.frame)
     aligned: Any = data.tree_replace({"_impl.contact.frame": frame})
     return aligned
+
+
+def _keep_deepest(choices: np.ndarray, data: mjx.Data) -> mjx.Data:
+    """Of the contacts of one geom with geoms of the same choice, the deepest.
+
+    MuJoCo has one contact for a box at a pillar, on the lower or the upper edge of the
+    box; here a ball of the pillar stands for each edge.
+    """
+    impl: Any = data._impl
+    contact = impl.contact
+    group = jnp.asarray(choices)[contact.geom]
+    key = jnp.where(group > 0, -group, contact.geom)
+    is_rival = (key[:, None] == key).all(-1) & (group > 0).any(-1)
+    order = np.arange(len(contact.dist))
+    deeper = contact.dist < contact.dist[:, None]
+    deeper |= (contact.dist == contact.dist[:, None]) & (order < order[:, None])
+    dist = jnp.where((is_rival & deeper).any(-1), 1.0, contact.dist)
+    chosen: Any = data.tree_replace({"_impl.contact.dist": dist})
+    return chosen
