@@ -72,9 +72,9 @@ RUN_EPOCHS, RUN_SEEDS, RUN_EPISODES = 20, (0, 1), 2
 # seed.
 RANDOM_SIZES = {
     "Goal-Hazard-Point": (8, 60),
-    "Goal-Hazard-Car": (4, 40),
-    "Goal-Pillar-Point": (8, 30),
-    "Goal-Pillar-Car": (4, 30),
+    "Goal-Hazard-Car": (8, 60),
+    "Goal-Pillar-Point": (8, 40),
+    "Goal-Pillar-Car": (4, 60),
 }
 SEEDS, EPISODES = (0, 1, 2), 50
 

@@ -34,7 +34,7 @@ WHEELS = (("left", -0.03), ("right", 0.03))  # body, x of the wheel's centre
 # Pillars that can be touched at once. Their centres are at least 0.6 m apart, so that
 # three fit within the reach of a Car and, for four, of a Doggo; the box's reach would
 # allow four too, but only two on one side of it.
-NEAREST = {"Point": 2, "Car": 3, "Doggo": 4}
+NEAREST = {"Point": 3, "Car": 3, "Doggo": 4}
 NEAREST_TO_BOX = 2
 # Contacts that the solver sees, the deepest ones: on the floor (a wheel has two at a
 # time), with pillars, with a box or vase, and between that and floor or pillars.
