@@ -179,7 +179,7 @@ def pillars_around(
 
 
 def smooth_noise(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    """The golden data's random actions, x = 0.9 x + 0.45 randn, along the first axis."""
+    """The golden data's random actions: x = 0.9 x + 0.45 randn along the first axis."""
     out = np.zeros(shape)
     for step in range(shape[0]):
         previous = out[step - 1] if step else 0.0

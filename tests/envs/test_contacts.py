@@ -8,6 +8,7 @@ import functools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
@@ -117,9 +118,9 @@ def test_models_have_the_masses_of_the_scene(robot, physics):
 
 @pytest.mark.parametrize("robot", ["Point", "Car"])
 def test_normals_of_the_scene_point_away_from_pillars(robot):
-    """They do not with MuJoCo's search for several contacts, which the scene leaves out.
+    """They do not with MuJoCo's search for several contacts, which the scene omits.
 
-    With it a Car's normals are off by half a radian, as box and cylinder touch at edges.
+    With it a Car's normals are half a radian off where box and cylinder touch.
     """
     config = env_config(f"Goal-Pillar-{robot}")
     model = scene_model(config)
@@ -186,11 +187,12 @@ def missed(config: EnvConfig, seed: int, num_worlds: int, num_steps: int) -> Any
     box_parts = [model.geom(name).id for name in BOX_PARTS if config.task == "Push"]
     for _ in range(num_worlds):
         layout = _cluster(config, rng)
+        pillars = np.asarray(layout.pillars)
         scenes.put(model, data, scenes.start_qpos(config, model, layout), 0.0)
-        scenes.put_pillars(model, data, layout.pillars)
+        scenes.put_pillars(model, data, pillars)
         noise = scenes.smooth_noise(rng, num_steps, 1, model.nu)
         for step in range(num_steps):
-            action = _push_around(config, data, layout.pillars, step, noise[step])
+            action = _push_around(config, data, pillars, step, noise[step])
             centres = [data.qpos[:2].copy()]
             if config.task == "Push":
                 centres.append(data.qpos[-7:-5].copy())
@@ -203,7 +205,7 @@ def missed(config: EnvConfig, seed: int, num_worlds: int, num_steps: int) -> Any
                     touched[1] |= _touched_by(model, data, box_parts)
             for row, (xy, found) in enumerate(zip(centres, touched, strict=False)):
                 if found:
-                    order = np.argsort(((layout.pillars - xy) ** 2).sum(-1)).tolist()
+                    order = np.argsort(((pillars - xy) ** 2).sum(-1)).tolist()
                     counts[row, : max(order.index(i) for i in found) + 1] += 1
     return counts
 
@@ -285,7 +287,7 @@ def control_steps(name: str, physics: str = "reduced") -> tuple[Compiled, Any, A
     state = scenes.worlds_at(
         world.env, steps.layouts, steps.qpos, steps.qvel, steps.warmstart
     )
-    return world, world.step(state, steps.actions), steps
+    return world, world.step(state, jnp.asarray(steps.actions)), steps
 
 
 def assert_quantiles(error: np.ndarray, bounds: dict[float, float]) -> None:
@@ -294,24 +296,30 @@ def assert_quantiles(error: np.ndarray, bounds: dict[float, float]) -> None:
 
 
 # Quantile -> largest difference of the robot's planar velocity, and share of steps
-# after which both say the same about contact; about twice what was measured.
+# after which both say the same about contact; two to four times what was measured.
+# MJX's capsules meet boxes less exactly than the balls of the reduced model do, and
+# miss some light touches.
+TIGHT = {0.5: 1e-4, 0.9: 1e-3, 0.98: 2e-2}
 PILLAR_STEPS = {
-    "Goal-Pillar-Point": ({0.5: 1e-4, 0.9: 1e-3, 0.98: 2e-2}, 0.97),
-    "Goal-Pillar-Car": ({0.5: 1e-4, 0.9: 2e-3, 0.98: 5e-2}, 0.95),
-    "Goal-Pillar-Doggo": ({0.5: 1e-4, 0.9: 1e-3, 0.98: 2e-2}, 0.97),
+    ("Goal-Pillar-Point", "reduced"): (TIGHT, 0.97),
+    ("Goal-Pillar-Car", "reduced"): ({0.5: 1e-4, 0.9: 1e-3, 0.98: 0.15}, 0.98),
+    ("Goal-Pillar-Doggo", "reduced"): (TIGHT, 0.98),
+    ("Goal-Pillar-Point", "full"): ({0.5: 1e-2, 0.9: 0.15}, 0.8),
+    ("Goal-Pillar-Car", "full"): ({0.5: 1e-4, 0.9: 0.15}, 0.8),
 }
 
 
 def check_pillar_steps(name: str, physics: str = "reduced") -> None:
     _, after, steps = control_steps(name, physics)
-    bounds, agreement = PILLAR_STEPS[name]
+    bounds, agreement = PILLAR_STEPS[name, physics]
     qvel = np.asarray(after.data.qvel)
     assert_quantiles(np.abs(qvel - steps.next_qvel)[:, :2].max(-1), bounds)
     qpos = np.asarray(after.data.qpos)
-    assert np.abs(qpos - steps.next_qpos)[:, :2].max() < 5e-3
+    assert np.abs(qpos - steps.next_qpos)[:, :2].max() < 2e-2
     touches = np.asarray(after.data.bodies.pillar_contacts) > 0
     assert np.mean(touches == steps.touches) >= agreement
-    assert np.mean(touches) == pytest.approx(np.mean(steps.touches), abs=0.03)
+    share, slack = np.mean(steps.touches), 1 - agreement
+    assert np.mean(touches) == pytest.approx(share, abs=slack)
     np.testing.assert_array_equal(after.cost, touches)
 
 
@@ -368,17 +376,20 @@ def test_point_meets_pillars_when_the_scene_does():
 
 # The box has four feet for twenty and the arrow is a bar: single steps agree roughly,
 # averages (below) well. Quantile -> difference of robot xy, box xyz velocities (m/s).
+# With all twenty (full) a single step is what the solver and the arrow leave of it.
 PUSH_STEPS = {
-    "Push-Hazard-Point": ({0.5: 1e-2, 0.9: 3e-2}, {0.5: 0.2, 0.9: 0.5}),
-    "Push-Hazard-Car": ({0.5: 5e-4, 0.9: 2e-3}, {0.5: 0.2, 0.9: 0.5}),
-    "Push-Hazard-Doggo": ({0.5: 2e-3, 0.9: 3e-2}, {0.5: 0.2, 0.9: 0.5}),
+    ("Push-Hazard-Point", "reduced"): ({0.5: 1e-2, 0.9: 3e-2}, {0.5: 0.2, 0.9: 0.5}),
+    ("Push-Hazard-Car", "reduced"): ({0.5: 5e-4, 0.9: 2e-3}, {0.5: 0.2, 0.9: 0.5}),
+    ("Push-Hazard-Doggo", "reduced"): ({0.5: 2e-3, 0.9: 3e-2}, {0.5: 0.2, 0.9: 0.5}),
+    ("Push-Hazard-Point", "full"): ({0.5: 1e-3, 0.9: 1e-2}, {0.5: 0.03, 0.9: 0.1}),
+    ("Push-Hazard-Car", "full"): ({0.5: 2e-4, 0.9: 1e-3}, {0.5: 0.1, 0.9: 0.3}),
 }
-BOX_PLACE = 0.02  # metres in one control step in contact, the largest
+BOX_PLACE = 0.05  # metres in one control step in contact, the largest
 
 
 def check_push_steps(name: str, physics: str = "reduced") -> None:
     _, after, steps = control_steps(name, physics)
-    robot, box = PUSH_STEPS[name]
+    robot, box = PUSH_STEPS[name, physics]
     error = np.abs(np.asarray(after.data.qvel) - steps.next_qvel)
     assert_quantiles(error[:, :2].max(-1), robot)
     assert_quantiles(error[:, -6:-3].max(-1), box)
@@ -391,7 +402,7 @@ def test_single_steps_of_a_point_at_the_box():
 
 
 def test_point_meets_the_box_when_the_scene_does():
-    """Straight, offset, rotated and far boxes, up to first contact and five steps on."""
+    """Straight, offset, rotated and far boxes, until five steps after the contact."""
     world = compiled("Push-Hazard-Point")
     config = world.env.config
     rng = np.random.default_rng(5)
@@ -405,7 +416,7 @@ def test_point_meets_the_box_when_the_scene_does():
     def policy(*_: Any) -> np.ndarray:
         return np.tile([1.0, 0.0], (NUM, 1))
 
-    num_steps = 50
+    num_steps = 60
     expected = scenes.run_scene(config, batch, policy, num_steps)
     got = scenes.run_env(world.env, world.step, batch, policy, num_steps)
     assert np.abs(got.onset - expected.onset).max() <= 2

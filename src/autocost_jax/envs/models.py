@@ -7,7 +7,7 @@
 
 "full" differs from the scene in that pillars are capsules (MJX collides no box with a
 cylinder), that the Point does not touch the floor (it meets it at distance exactly 0,
-which MuJoCo does not count as a contact) and that the wheels of a Car touch the box
+which MuJoCo does not count as a contact) and that the wheels of a Car touch objects
 through spheres. "reduced" differs in what the functions `_reduce_*` say.
 
 All models of a configuration have the same `qpos`: the robot's, then the box's seven
@@ -202,19 +202,29 @@ def _complete(spec: Any, config: EnvConfig, robot: list[str]) -> list[str]:
         _add_pillar(spec, f"pillar{i}", CAPSULE, size)
         for j in range(i):
             spec.add_exclude(bodyname1=f"pillar{i}", bodyname2=f"pillar{j}")
-    if config.robot != "Car" or not (config.task == "Push" or config.vases_num):
-        return []
-    proxies = []
-    for wheel, x in WHEELS:
-        proxies.append(f"{wheel}_sphere")
-        _add_proxy(spec, wheel, proxies[-1], SPHERE, [0.05, 0, 0], pos=[x, 0, 0])
-        parts = BOX_PARTS if config.task == "Push" else ()
-        for name in (*parts, *(f"vase{i}" for i in range(config.vases_num))):
-            _add_pair(spec, proxies[-1], name)
-        bodies = ("box",) if config.task == "Push" else ()
-        for name in (*bodies, *(f"vase{i}" for i in range(config.vases_num))):
-            spec.add_exclude(bodyname1=wheel, bodyname2=name)
-    return proxies
+    return _add_wheel_spheres(spec, config) if config.robot == "Car" else []
+
+
+def _add_wheel_spheres(spec: Any, config: EnvConfig) -> list[str]:
+    """Spheres that meet objects for a Car's wheels; returns their names.
+
+    MJX collides cylinders with the floor alone.
+    """
+    parts: dict[str, Sequence[str]] = {
+        f"vase{i}": (f"vase{i}",) for i in range(config.vases_num)
+    }
+    if config.task == "Push":
+        parts["box"] = BOX_PARTS
+    parts |= {f"pillar{i}": (f"pillar{i}",) for i in range(config.pillars_num)}
+    spheres = []
+    for wheel, x in WHEELS if parts else ():
+        spheres.append(f"{wheel}_sphere")
+        _add_proxy(spec, wheel, spheres[-1], SPHERE, [0.05, 0, 0], pos=[x, 0, 0])
+        for body, geoms in parts.items():
+            spec.add_exclude(bodyname1=wheel, bodyname2=body)
+            for geom in geoms:
+                _add_pair(spec, spheres[-1], geom)
+    return spheres
 
 
 def _reduce(spec: Any, config: EnvConfig) -> list[str]:
