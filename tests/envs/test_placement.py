@@ -86,7 +86,7 @@ def test_measured_failures(name, record_property):
     assert fourfold == 0.0
 
 
-# --- on the device ---------------------------------------------------------------------
+# --- on the device ----------------------------------------------------------
 
 
 @pytest.fixture(scope="module", params=["Push-Pillar-Car", "PointGoal2", "DoggoPush2"])
