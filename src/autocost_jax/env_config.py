@@ -21,7 +21,7 @@ from autocost_jax.checks import (
 
 TaskName = Literal["Goal", "Push"]
 Robot = Literal["Point", "Car", "Doggo"]
-Physics = Literal["reduced", "full"]
+Physics = Literal["reduced", "full", "closed_form"]
 LIDAR_BINS = 8  # the paper's constraint lidar: the intrinsic network's input
 
 
@@ -33,9 +33,10 @@ class EnvConfig:
     extents and keepouts are ours (the paper does not state them): engine defaults where
     Safety Gym has one, 8 hazards as in its Goal1. `env_config` has all the others.
 
-    `physics` chooses the collision model: "full" has Safety Gym's geoms at condim 6
-    (pillars as capsules, which MJX needs), "reduced" fewer and simpler contacts with
-    the same masses; `envs/models.py` lists them.
+    `physics` chooses the model: "full" has Safety Gym's geoms at condim 6 (pillars as
+    capsules, which MJX needs), "reduced" fewer and simpler contacts with the same
+    masses; `envs/models.py` lists them. "closed_form" is for a Point that nothing can
+    touch, with its equations of motion in place of MJX: the same numbers, faster.
     """
 
     task: TaskName = "Goal"
@@ -91,6 +92,13 @@ class EnvConfig:
             value, allowed = getattr(self, name), get_args(kind)
             require(value in allowed, name, f"one of {', '.join(allowed)}", value)
         require_counts(self, "num_steps", "frameskip_binom_n", "lidar_num_bins")
+        is_free = self.task == "Goal" and not (self.pillars_num or self.vases_num)
+        require(
+            self.physics != "closed_form" or (self.robot == "Point" and is_free),
+            "physics",
+            "reduced or full where the robot is no Point or can touch something",
+            self.physics,
+        )
         for name in _NUMBERS:
             value = getattr(self, name)
             require(is_integer(value) and value >= 0, name, "an integer >= 0", value)

@@ -13,6 +13,7 @@ import numpy as np
 
 from autocost_jax.env_config import ENVS, LIDAR_BINS, EnvConfig, env_config
 from autocost_jax.envs import layout as layouts
+from autocost_jax.envs.closed_form import make_closed_form_world
 from autocost_jax.envs.constraints import Constraint, distances_to, make_constraint
 from autocost_jax.envs.sensors import flatten, lidar, slices
 from autocost_jax.envs.tasks import Task, make_task
@@ -87,10 +88,11 @@ def make_env(name_or_config: str | EnvConfig) -> Env:
     config = name_or_config
     if isinstance(config, str):
         config = env_config(config)
+    make = make_closed_form_world if config.physics == "closed_form" else make_world
     parts = _Parts(
         config=config,
         arena=layouts.make_arena(config),
-        world=make_world(config),
+        world=make(config),
         task=make_task(config),
         constraint=make_constraint(config),
         observed=_observed_kinds(config),

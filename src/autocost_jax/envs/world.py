@@ -97,15 +97,7 @@ def make_world(config: EnvConfig) -> World:
         time = state.time + num_substeps * model.opt.timestep
         return _observe(scene, start, moving, time)
 
-    readings = {
-        mj_model.sensor(i).name: _reading(mj_model, i) for i in range(mj_model.nsensor)
-    }
-
-    def sensors(state: PhysicsState) -> dict[str, jax.Array]:
-        return {name: read(state.sensordata) for name, read in readings.items()}
-
-    zeros = np.zeros(mj_model.nsensordata)
-    sizes = {name: jax.eval_shape(read, zeros).size for name, read in readings.items()}
+    sensors, sizes = make_readings(mj_model)
     return World(
         mj_model=mj_model,
         place=place,
@@ -116,6 +108,22 @@ def make_world(config: EnvConfig) -> World:
         dt=num_substeps * float(mj_model.opt.timestep),
         dtype=rest.qpos.dtype,
     )
+
+
+def make_readings(
+    mj_model: Any,
+) -> tuple[Callable[[PhysicsState], dict[str, jax.Array]], dict[str, int]]:
+    """The `sensors` and `sensor_sizes` of a World of this model."""
+    readings = {
+        mj_model.sensor(i).name: _reading(mj_model, i) for i in range(mj_model.nsensor)
+    }
+
+    def sensors(state: PhysicsState) -> dict[str, jax.Array]:
+        return {name: read(state.sensordata) for name, read in readings.items()}
+
+    zeros = np.zeros(mj_model.nsensordata)
+    sizes = {name: jax.eval_shape(read, zeros).size for name, read in readings.items()}
+    return sensors, sizes
 
 
 def _reading(mj_model: Any, index: int) -> Callable[[jax.Array], jax.Array]:
