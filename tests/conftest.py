@@ -54,6 +54,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def compilation_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Programs that two tests have in common are compiled once a session."""
     path = tmp_path_factory.getbasetemp() / "jax_cache"
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(path)  # for command lines under test
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 

@@ -8,12 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import yaml
 
 import autocost_jax
 from autocost_jax import evolve as evolve_module
+from autocost_jax.commandline import use_compile_cache
 from autocost_jax.config import preset
 from autocost_jax.evolve import main
 from autocost_jax.store import RunDirError, list_stages, read_config, read_metrics
@@ -32,10 +34,11 @@ def command(out: Path, *flags: str) -> list[str]:
 def environment(tmp_path_factory):
     """Subprocesses share a compilation cache: cold for the first, then warm."""
     cache = tmp_path_factory.mktemp("cache")
-    return os.environ | {
-        "JAX_COMPILATION_CACHE_DIR": str(cache),
+    names = os.environ | {
+        "XDG_CACHE_HOME": str(cache),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
+    return {k: v for k, v in names.items() if k != "JAX_COMPILATION_CACHE_DIR"}
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +84,26 @@ def test_a_run_leaves_everything_the_readme_names(whole):
     assert config.seed == 3
     assert facts["versions"]["jax"]
     assert autocost_jax.load_cost(out / "cost.npz").shape == (41,)
+
+
+def test_compiled_programs_are_kept_for_the_next_run(whole, environment):
+    kept = Path(environment["XDG_CACHE_HOME"]) / "autocost_jax"
+    assert list(kept.glob("jit_chunk*"))
+
+
+def test_compile_cache_can_be_off_elsewhere_or_impossible(monkeypatch, tmp_path):
+    before = jax.config.values["jax_compilation_cache_dir"]
+    try:
+        assert use_compile_cache(False) is None
+        assert jax.config.values["jax_compilation_cache_dir"] == before
+        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "mine"))
+        assert use_compile_cache(True) == tmp_path / "mine"
+        assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path / "mine")
+        (tmp_path / "file").touch()
+        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file" / "x"))
+        assert use_compile_cache(True) is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
 
 
 def test_metrics_have_one_row_an_epoch_with_every_slot(whole):

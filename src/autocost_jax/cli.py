@@ -13,6 +13,7 @@ from autocost_jax.commandline import (
     guarded,
     parse,
     quiet,
+    use_compile_cache,
     use_devices,
     with_env,
 )
@@ -69,6 +70,7 @@ def _train(argv: list[str]) -> None:
           resume: continue the run in `out` with its own settings.
           overwrite: start over in a directory that already holds a run.
           devices: devices to use; default: all; a CPU counts one a core.
+          compile_cache: keep compiled programs in the user's cache directory.
           episodes: fresh episodes a policy is scored in.
           train: worlds, epochs and the learners' settings.
         """
@@ -86,6 +88,7 @@ def _train(argv: list[str]) -> None:
         resume: bool = False
         overwrite: bool = False
         devices: int | None = None
+        compile_cache: bool = True
         episodes: int = 100
         train: Annotated[TrainConfig, tyro.conf.OmitArgPrefixes] = field(
             default_factory=TrainConfig
@@ -94,6 +97,7 @@ def _train(argv: list[str]) -> None:
     train = preset(flag(argv, "--preset") or "laptop").train
     default = Options(train=with_env(train, argv))
     options = parse(Options, argv, "autocost train", default=default)
+    use_compile_cache(options.compile_cache)
     devices = use_devices(options.devices)  # before anything of JAX runs
     from autocost_jax.methods import Method, TableConfig, run_table
     from autocost_jax.store import read_config
@@ -138,6 +142,7 @@ def _evaluate(argv: list[str]) -> None:
           deterministic: act by the mean instead of sampling.
           seed: of the episodes.
           json: file to write the scores to.
+          compile_cache: keep compiled programs in the user's cache directory.
         """
 
         run: Path
@@ -146,10 +151,12 @@ def _evaluate(argv: list[str]) -> None:
         deterministic: bool = False
         seed: int = 0
         json: Path | None = None
+        compile_cache: bool = True
 
     options = parse(Options, argv, "autocost evaluate")
     if options.episodes < 1:
         raise ValueError(f"episodes must be >= 1, got {options.episodes}")
+    use_compile_cache(options.compile_cache)
     import jax
 
     from autocost_jax.arrays import write_atomic
@@ -210,6 +217,7 @@ def _render(argv: list[str]) -> None:
           video: film to write as well, .mp4 or .gif.
           camera: of the film: track (the robot), fixed, or top.
           size: width and height of the film; default: 640 480, a .gif's 480 360.
+          compile_cache: keep compiled programs in the user's cache directory.
         """
 
         run: Path | None = None
@@ -222,10 +230,12 @@ def _render(argv: list[str]) -> None:
         video: Path | None = None
         camera: Literal["track", "fixed", "top"] = "track"
         size: tuple[int, int] | None = None
+        compile_cache: bool = True
 
     options = parse(Options, argv, "autocost render")
     if (options.run is None) == (options.env is None):
         raise ValueError("give either --run DIR or --env NAME")
+    use_compile_cache(options.compile_cache)
     from autocost_jax.picture import film_size
     from autocost_jax.render import best_policy, run_player, script_player, show
 

@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 from autocost_jax.config import TrainConfig
@@ -97,6 +98,36 @@ def quiet() -> None:
     """Keep start-up chatter of libraries (optional parts not installed) away."""
     logging.getLogger("absl").setLevel(logging.ERROR)
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+
+def use_compile_cache(is_wanted: bool) -> Path | None:
+    """Keep compiled programs between runs, so that a second start takes seconds.
+
+    They go to `autocost_jax` in the user's cache directory ($XDG_CACHE_HOME, by default
+    ~/.cache), or wherever $JAX_COMPILATION_CACHE_DIR says. JAX knows a program by its
+    code, shapes, versions and devices, so an entry is never wrong, only unused.
+
+    Args:
+      is_wanted: False leaves JAX as it is.
+
+    Returns:
+      The directory; None if not wanted, or if it cannot be written to.
+    """
+    import jax
+
+    if not is_wanted:
+        return None
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    default = Path(base) / "autocost_jax"
+    path = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or default)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    if not os.access(path, os.W_OK):
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    return path
 
 
 def use_devices(count: int | None) -> Sequence[Any]:

@@ -20,6 +20,7 @@ from autocost_jax.commandline import (
     guarded,
     parse,
     quiet,
+    use_compile_cache,
     use_devices,
     with_env,
 )
@@ -40,6 +41,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _main(argv: list[str]) -> None:
     defaults = _defaults(argv)
     options = parse(_options_type(), argv, PROG, default=defaults, description=__doc__)
+    use_compile_cache(options.compile_cache)
     devices = use_devices(options.devices)  # before anything of JAX runs
     config = options.search
     from autocost_jax.run import describe, run_search
@@ -77,6 +79,7 @@ def _options_type() -> Any:
           resume: continue the run in `out` from its newest checkpoint.
           overwrite: start over in a directory that already holds a run.
           devices: devices to use; default: all; a CPU counts one a core.
+          compile_cache: keep compiled programs in the user's cache directory.
           dry_run: say what would be done, and stop.
           eval_episodes: fresh episodes in which the best cost's agents are scored.
           search: the search's settings.
@@ -89,6 +92,7 @@ def _options_type() -> Any:
         resume: bool = False
         overwrite: bool = False
         devices: int | None = None
+        compile_cache: bool = True
         dry_run: bool = False
         eval_episodes: int = 100
         search: Annotated[SearchConfig, tyro.conf.OmitArgPrefixes] = field(

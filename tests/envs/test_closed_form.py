@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from env_data import NUM_WORLDS, blank_layout, compile_env, states_at
@@ -96,7 +97,7 @@ def test_turns_as_fast_as_the_fact_sheet_says():
     env = compile_env(CONFIG)
     num_steps, skipped = 200, 50
     turns = np.resize(list(expected), NUM_WORLDS)
-    action = np.stack([np.zeros(NUM_WORLDS), turns], 1)
+    action = jnp.asarray(np.stack([np.zeros(NUM_WORLDS), turns], 1))
     state = env.reset(jax.random.split(jax.random.key(0), NUM_WORLDS))
     headings = []
     for _ in range(num_steps):
