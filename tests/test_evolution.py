@@ -210,6 +210,33 @@ def test_chunks_of_another_length(events):
         )
 
 
+# Cohorts ------------------------------------------------------------------------
+
+
+def test_with_cohorts_fitness_is_of_whole_fresh_episodes():
+    """Pure or in chunks it is the same search, and its fitness no training metric."""
+    train = train_config(num_epochs=6, segments_per_episode=2)
+    config = dataclasses.replace(CONFIG, train=train)
+    assert config.final_rounds == 1
+    events = list(evolve(config))
+    pure = jax.jit(search(config))(jax.random.key(config.seed))
+    for stage, result in enumerate(results(events)):
+        np.testing.assert_allclose(
+            result.fitness.cost, pure.fitness.cost[stage], atol=ACROSS_PROGRAMS
+        )
+        np.testing.assert_allclose(
+            result.fitness.ep_return,
+            pure.fitness.ep_return[stage],
+            atol=ACROSS_PROGRAMS,
+        )
+        np.testing.assert_allclose(
+            result.fitness.ep_return, result.scores["ep_return"].mean(0), rtol=1e-5
+        )
+    history = events[-1][0].history["ep_return"]
+    trained = np.asarray(history)[-config.fitness_epochs :].mean((0, 1))
+    assert np.abs(results(events)[-1].fitness.ep_return - trained).max() > 1e-3
+
+
 # One trace, one compile ---------------------------------------------------------
 
 

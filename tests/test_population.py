@@ -19,6 +19,7 @@ from autocost_jax.population import (
     make_population,
     stack_slots,
 )
+from autocost_jax.train import final_episodes, init_learner, run_stage
 from toys import TRAIN, Counter, intrinsic_slots, make_toy_env, train_config
 
 ALGORITHMS = ("ppo_lagrangian", "cpo")
@@ -298,12 +299,43 @@ def test_the_devices_trained_in_float64(devices):
 # The face of it -----------------------------------------------------------------
 
 
-def test_segments_are_refused():
+def test_cohorts_travel_with_their_learners():
+    """In the program as in the plain function; and final episodes are whole ones."""
     env = make_toy_env()
-    config = train_config(segments_per_episode=2)
+    config = train_config(segments_per_episode=2, num_epochs=EPOCHS)
     agents = make_agents(ALGORITHMS, config, env)
-    with pytest.raises(ValueError, match=r"segments_per_episode must be 1 .*, got 2"):
-        make_population(env, agents, config)
+    program = make_population(env, agents, config, final_rounds=3)
+    slots = groups()
+    learners = program.init(slots)
+    for group in learners:
+        assert group.worlds is not None
+        assert group.worlds.age.shape == (SIZE, config.num_worlds)
+        assert (np.asarray(group.worlds.age) == config.epoch_steps).all()
+
+    @jax.jit
+    def whole(slots):
+        first = tuple(
+            jax.vmap(lambda slot, agent=agent: init_learner(agent, slot))(group)
+            for agent, group in zip(agents, slots, strict=True)
+        )
+        learners, metrics = run_stage(env, agents, config, first, slots)
+        return metrics, final_episodes(env, agents, config, learners, slots, 3)
+
+    expected, expected_final = whole(slots)
+    rows = []
+    for epoch in range(EPOCHS):
+        learners, metrics = program.chunk(learners, slots, epoch)
+        rows.append(metrics)
+    final = program.final(learners, slots)
+    metrics = jax.tree.map(lambda *x: np.concatenate(x), *rows)
+    for got, want in ((metrics, expected), (final, expected_final)):
+        for group, reference in zip(got, want, strict=True):
+            for name in ("ep_cost", "ep_return", "distance_travelled"):
+                np.testing.assert_allclose(
+                    group[name], reference[name], rtol=1e-2, atol=1e-3, err_msg=name
+                )
+    assert final[0]["ep_cost"].shape == (3, SIZE)
+    assert len(np.unique(final[0]["ep_return"])) == 3 * SIZE  # fresh ones each round
 
 
 def test_candidates_share_their_random_numbers(key):

@@ -11,7 +11,7 @@ from autocost_jax.rollout import (
     reset_worlds,
     unroll,
 )
-from autocost_jax.train import init_learner, init_worlds, run_epoch
+from autocost_jax.train import init_learner, run_epoch, start_cohorts
 from toys import NUM_STEPS, RADIUS, intrinsic_slots, linear_agent, make_toy_env
 from toys import train_config as make_config
 
@@ -143,17 +143,13 @@ def test_cohorts_have_true_ages(segments):
 
     @jax.jit
     def epochs(learners):
-        carried = init_worlds(env, (agent,), config, learners, slots)
+        def body(learners, epoch):
+            after, metrics = run_epoch(env, (agent,), config, learners, slots, epoch)
+            return after, (learners[0].worlds, after[0].worlds, metrics)
 
-        def body(state, epoch):
-            learners, carried = state
-            learners, after, metrics = run_epoch(
-                env, (agent,), config, learners, slots, carried, epoch
-            )
-            return (learners, after), (carried, after, metrics)
-
+        learners = start_cohorts(env, (agent,), config, learners, slots)
         numbers = jnp.arange(2 * segments, dtype=jnp.int32)
-        return jax.lax.scan(body, (learners, carried), numbers)[1]
+        return jax.lax.scan(body, learners, numbers)[1]
 
     before, after, metrics = epochs(learners)
     assert metrics[0]["ep_return"].shape == (2 * segments, 2)

@@ -214,8 +214,8 @@ def test_a_broken_agent_keeps_its_last_finite_state(env):
     @jax.jit
     def epochs(learner):
         def body(learner, epoch):
-            (learner,), _, (metrics,) = run_epoch(
-                env, (agent,), TRAIN, (learner,), (slots,), None, epoch
+            (learner,), (metrics,) = run_epoch(
+                env, (agent,), TRAIN, (learner,), (slots,), epoch
             )
             return learner, (learner, metrics["frozen"])
 

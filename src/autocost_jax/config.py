@@ -148,7 +148,8 @@ class SearchConfig:
     Ours: `init_std` 1 (the paper: "randomly sample"), 7 stages, each child mutated
     additively or multiplicatively with probability 1/2, factors element-wise uniform
     in [`mutation_low`, `mutation_high`], elites kept and retrained with new seeds,
-    "converged" = the mean over the last `fitness_epochs` epochs, "zero violation" =
+    "converged" = the mean over the last `fitness_epochs` epochs (with
+    `segments_per_episode` > 1 over as many whole fresh episodes), "zero violation" =
     a mean extrinsic cost <= `zero_tolerance` over those episodes.
     `selection="random"` replaces the ranking by a random choice: the control.
     """
@@ -198,8 +199,6 @@ class SearchConfig:
             self, "init_std", "mutation_std", "mutation_low", "mutation_high"
         )
         require_finite(self, "cost_limit")
-        segments = self.train.segments_per_episode
-        require(segments == 1, "segments_per_episode", "1 in a search", segments)
         low, high = self.mutation_low, self.mutation_high
         require(high >= low, "mutation_high", f">= mutation_low={low}", high)
         tolerance = self.zero_tolerance
@@ -216,8 +215,18 @@ class SearchConfig:
         require(ok, "seed", "an integer in [0, 2**32)", self.seed)
 
     @property
+    def final_rounds(self) -> int:
+        """Rounds of whole fresh episodes that a stage's fitness is taken from.
+
+        0 where the last `fitness_epochs` epochs are such episodes themselves; else
+        enough for as many episodes.
+        """
+        segments = self.train.segments_per_episode
+        return 0 if segments == 1 else -(-self.fitness_epochs // segments)
+
+    @property
     def env_steps(self) -> int:
-        """Environment steps of the whole search."""
+        """Environment steps of the whole search's training."""
         train = self.train
         slots = self.population_size * len(self.algorithms)
         epoch = train.num_worlds * train.env.num_steps

@@ -26,7 +26,7 @@ from autocost_jax.population import (
     make_population,
 )
 from autocost_jax.records import Key, Metrics, Slot
-from autocost_jax.train import Learner, init_learner, run_stage
+from autocost_jax.train import Learner, final_episodes, init_learner, run_stage
 
 # What the fitness and the report are made of, kept for every epoch of a stage.
 TRACKED = (
@@ -179,7 +179,8 @@ def stage_result(
     Args:
       config: the search.
       candidates: [P, D].
-      history: `TRACKED` metrics [num_epochs, A, P].
+      history: `TRACKED` metrics [num_epochs, A, P]; with cohorts those of whole
+        episodes of the final policies, [rounds, A, P].
       frozen: [A, P] bool.
     """
     # A state that was not visited in an epoch has no intrinsic cost there: NaN.
@@ -257,10 +258,11 @@ def search(
             learners, metrics = run_stage(
                 env, agents, config.train, learners, slots, bank
             )
-            history = {
-                name: jnp.stack([group[name] for group in metrics], 1)
-                for name in TRACKED
-            }
+            if config.final_rounds:
+                metrics = final_episodes(
+                    env, agents, config.train, learners, slots, config.final_rounds
+                )
+            history = _tracked(metrics)
             frozen = jnp.stack([group.frozen for group in learners])
             state, result = functions.end(state, stage, candidates, history, frozen)
             return state, (result.fitness, result.scores)
@@ -284,7 +286,9 @@ def make_searcher(
     return Searcher(
         config=config,
         root=root,
-        population=make_population(env, agents, config.train, bank, devices),
+        population=make_population(
+            env, agents, config.train, bank, devices, config.final_rounds
+        ),
         stage=jit_bundle(stage_functions(config, root, bank)),
     )
 
@@ -356,12 +360,19 @@ def _run_chunk(searcher: Searcher, state: SearchState) -> tuple[SearchState, Pro
     if after < config.train.num_epochs:
         return state, progress
     frozen = jnp.stack([group.frozen for group in learners])
+    if config.final_rounds:
+        history = _tracked(searcher.population.final(learners, slots))
     es_state, result = functions.end(state.es, stage, state.candidates, history, frozen)
     progress = progress._replace(result=result, learners=learners)
     if stage + 1 < config.num_stages:
         return _begin_stage(searcher, es_state, stage + 1), progress
     over = jnp.asarray(config.num_stages, jnp.int32)
     return state.replace(es=es_state, stage=over), progress
+
+
+def _tracked(metrics: tuple[Metrics, ...]) -> Metrics:
+    """Groups of metrics [K, P] as one table, each [K, A, P]."""
+    return {name: jnp.stack([group[name] for group in metrics], 1) for name in TRACKED}
 
 
 def best_of(config: SearchConfig, state: ESState) -> Any:

@@ -23,7 +23,13 @@ from autocost_jax.costs import BANK, CostTerm
 from autocost_jax.envs.env import Env
 from autocost_jax.evaluate import Episodes, run_episodes, score
 from autocost_jax.records import EvalResult, Key, Metrics, Slot, TrainingCost
-from autocost_jax.train import Learner, init_learner, run_epoch
+from autocost_jax.train import (
+    Learner,
+    final_episodes,
+    init_learner,
+    run_epoch,
+    start_cohorts,
+)
 
 AXIS = "slot"
 # It runs once a stage: compiling it took 11 s at level 3 and 2 s at level 1.
@@ -36,6 +42,8 @@ class Population(NamedTuple):
 
     Attributes:
       init: slots -> learners; both one stacked pytree [P_g, ...] a group.
+      final: (learners, slots) -> what trained agents do in whole fresh episodes,
+        metrics [rounds, P_g] a group.
       chunk: (learners, slots, epoch) -> (learners, metrics [K, P_g] a group); the
         learners passed in are donated.
       compile: (learners, slots) -> None, compiles `chunk` ahead of its first call.
@@ -43,6 +51,7 @@ class Population(NamedTuple):
     """
 
     init: Callable[[tuple[Slot, ...]], tuple[Learner, ...]]
+    final: Callable[..., tuple[Metrics, ...]]
     chunk: Callable[..., tuple[tuple[Learner, ...], tuple[Metrics, ...]]]
     compile: Callable[[tuple[Learner, ...], tuple[Slot, ...]], Any]
     num_devices: int
@@ -84,31 +93,37 @@ def make_population(
     config: TrainConfig,
     bank: Sequence[CostTerm] = BANK,
     devices: Sequence[Any] | None = None,
+    final_rounds: int = 1,
 ) -> Population:
     """The program that trains groups of slots, one group for each agent.
 
     Args:
       env: the environment all slots share.
       agents: one algorithm for each group.
-      config: sizes; `segments_per_episode` must be 1.
+      config: sizes.
       bank: the cost terms.
       devices: default: the first device only.
-
-    Raises:
-      ValueError: for `segments_per_episode` > 1, whose carried worlds the chunk does
-        not hold; `train.run_stage` does.
+      final_rounds: of `final`.
     """
-    if config.segments_per_episode != 1:
-        raise ValueError(
-            "segments_per_episode must be 1 in a population, "
-            f"got {config.segments_per_episode}"
-        )
     agents, bank = tuple(agents), tuple(bank)
     mesh = Mesh(np.asarray(devices or jax.devices()[:1]), (AXIS,))
     chunk_fn = _chunk_fn(env, agents, config, bank, mesh)
+    is_short = config.segments_per_episode == 1  # else it steps worlds, too
+    is_cpu = mesh.devices.flat[0].platform == "cpu"
     init_fn = jax.jit(
-        _sharded(lambda slots: _init(agents, slots), mesh, P(AXIS)),
-        compiler_options=INIT_OPTIONS if mesh.devices.flat[0].platform == "cpu" else {},
+        _sharded(lambda slots: _init(env, agents, config, slots), mesh, P(AXIS)),
+        compiler_options=INIT_OPTIONS if is_cpu and is_short else {},
+    )
+    final_fn = jax.jit(
+        jax.shard_map(
+            lambda learners, slots: final_episodes(
+                env, agents, config, learners, slots, final_rounds
+            ),
+            mesh=mesh,
+            in_specs=P(AXIS),
+            out_specs=P(None, AXIS),
+            check_vma=False,
+        )
     )
     compiled: dict[str, Any] = {}
 
@@ -127,13 +142,13 @@ def make_population(
             _pad(learners, mesh), _pad(slots, mesh), jnp.asarray(epoch, jnp.int32)
         )
         sizes = _sizes(slots)
-        metrics = tuple(
-            {name: value[:, :size] for name, value in group.items()}
-            for group, size in zip(metrics, sizes, strict=True)
-        )
-        return _unpad(learners, sizes), metrics
+        return _unpad(learners, sizes), _unpad_metrics(metrics, sizes)
 
-    return Population(init, chunk, compile_, mesh.size)
+    def final(learners: tuple[Learner, ...], slots: tuple[Slot, ...]):
+        metrics = final_fn(_pad(learners, mesh), _pad(slots, mesh))
+        return _unpad_metrics(metrics, _sizes(slots))
+
+    return Population(init, final, chunk, compile_, mesh.size)
 
 
 def make_evaluator(
@@ -162,11 +177,14 @@ def make_evaluator(
     return jax.jit(jax.vmap(evaluate_one, in_axes=(0, None)))
 
 
-def _init(agents: tuple[Agent, ...], slots: tuple[Slot, ...]) -> tuple[Learner, ...]:
-    return tuple(
+def _init(
+    env: Env, agents: tuple[Agent, ...], config: TrainConfig, slots: tuple[Slot, ...]
+) -> tuple[Learner, ...]:
+    learners = tuple(
         jax.vmap(lambda slot, agent=agent: init_learner(agent, slot))(group)
         for agent, group in zip(agents, slots, strict=True)
     )
+    return start_cohorts(env, agents, config, learners, slots)
 
 
 def _chunk_fn(
@@ -178,10 +196,7 @@ def _chunk_fn(
 ):
     def chunk(learners: tuple[Learner, ...], slots: tuple[Slot, ...], epoch: jax.Array):
         def body(learners: tuple[Learner, ...], epoch: jax.Array):
-            learners, _, metrics = run_epoch(
-                env, agents, config, learners, slots, None, epoch, bank
-            )
-            return learners, metrics
+            return run_epoch(env, agents, config, learners, slots, epoch, bank)
 
         epochs = epoch + jnp.arange(config.chunk_epochs, dtype=jnp.int32)
         return jax.lax.scan(body, learners, epochs)
@@ -221,4 +236,14 @@ def _unpad(groups: tuple[Any, ...], sizes: list[int]) -> tuple[Any, ...]:
     return tuple(
         jax.tree.map(lambda leaf, size=size: leaf[:size], group)
         for group, size in zip(groups, sizes, strict=True)
+    )
+
+
+def _unpad_metrics(
+    metrics: tuple[Metrics, ...], sizes: list[int]
+) -> tuple[Metrics, ...]:
+    """Metrics [K, P_g] without those of copies."""
+    return tuple(
+        {name: value[:, :size] for name, value in group.items()}
+        for group, size in zip(metrics, sizes, strict=True)
     )

@@ -74,6 +74,8 @@ def describe(config: SearchConfig, num_devices: int) -> list[str]:
     train, agent = config.train, config.train.agent
     algorithms = " + ".join(config.algorithms)
     worlds = f"{train.num_worlds} worlds x {train.env.num_steps} steps"
+    if train.segments_per_episode > 1:
+        worlds += f" in {train.segments_per_episode} cohorts"
     sizes = "-".join(str(size) for size in agent.hidden_sizes)
     return [
         f"{train.env.name}: {config.num_stages} stages of {config.population_size} "

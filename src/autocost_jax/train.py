@@ -4,6 +4,7 @@ A group is the slots of one algorithm, stacked on a leading axis P. All groups o
 population share one rollout, so the physics is traced, compiled and stepped once.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,11 +37,13 @@ class Learner(struct.PyTreeNode):
       frozen: [] bool; True once anything of it was non-finite. `agent` is then the
         last finite state.
       frozen_epoch: [] int32 epoch in which that happened, else -1.
+      worlds: [(k - 1) N, ...] its older cohorts; None for one segment an episode.
     """
 
     agent: Any
     frozen: jax.Array
     frozen_epoch: jax.Array
+    worlds: EnvState | None = None
 
 
 def slot_key(slot: Slot, epoch: jax.Array | int, purpose: int) -> Key:
@@ -63,33 +66,26 @@ def run_epoch(
     config: TrainConfig,
     learners: tuple[Learner, ...],
     slots: tuple[Slot, ...],
-    carried: EnvState | None,
     epoch: jax.Array,
     bank: Sequence[CostTerm] = BANK,
-) -> tuple[tuple[Learner, ...], EnvState | None, tuple[Metrics, ...]]:
+) -> tuple[tuple[Learner, ...], tuple[Metrics, ...]]:
     """One epoch of every slot of every group.
 
     Args:
       env: the environment all slots share.
       agents: one algorithm for each group.
       config: sizes of the epoch.
-      learners: for each group, stacked [P_g, ...].
+      learners: for each group, stacked [P_g, ...]; for k > 1 from `start_cohorts`.
       slots: for each group, stacked [P_g, ...].
-      carried: older cohorts [sum P_g, (k - 1) N, ...]; None for k = 1.
       epoch: [] int32, counted from the start of the stage.
       bank: the cost terms, static.
 
     Returns:
-      Learners, carried worlds, and for each group metrics [P_g].
+      Learners, and for each group metrics [P_g].
     """
-    worlds, trajectory, start = _rollout(
-        env, agents, config, learners, slots, carried, epoch
-    )
-    travelled = jax.tree.map(
-        lambda end, begin: (end - begin).astype(jnp.float32),
-        worlds.metrics,
-        start.metrics,
-    )
+    worlds, trajectory, start = _rollout(env, agents, config, learners, slots, epoch)
+    travelled = _travelled(worlds, start)
+    learners = _carry(config, learners, slots, worlds)
     after, metrics = [], []
     for agent, learner, slot, part in zip(
         agents, learners, slots, _parts(slots), strict=True
@@ -102,46 +98,89 @@ def run_epoch(
 
         group_trajectory = jax.tree.map(lambda x, part=part: x[:, part], trajectory)
         counts = jax.tree.map(lambda x, part=part: x[part], travelled)
-        learner, group_metrics = jax.vmap(update, in_axes=(0, 0, 1, 0))(
-            learner, slot, group_trajectory, counts
+        learned, group_metrics = jax.vmap(update, in_axes=(0, 0, 1, 0))(
+            learner.replace(worlds=None), slot, group_trajectory, counts
         )
-        after.append(learner)
+        after.append(learned.replace(worlds=learner.worlds))
         metrics.append(group_metrics)
-    carried = carry_cohorts(worlds, config.num_worlds, config.segments_per_episode, 1)
-    return tuple(after), carried, tuple(metrics)
+    return tuple(after), tuple(metrics)
 
 
-def init_worlds(
+def start_cohorts(
     env: Env,
     agents: Sequence[Agent],
     config: TrainConfig,
     learners: tuple[Learner, ...],
     slots: tuple[Slot, ...],
-) -> EnvState | None:
-    """The carried cohorts a stage starts with, of true ages; None for k = 1.
+) -> tuple[Learner, ...]:
+    """Learners with the cohorts that a stage starts with; as they are for k = 1.
 
     Cohort j has stepped j / k of an episode with the initial policies; what they saw
     is discarded.
     """
     segments = config.segments_per_episode
     if segments == 1:
-        return None
+        return learners
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *slots)
     num_carried = config.num_worlds * (segments - 1)
     before = jnp.asarray(-segments, jnp.int32)  # no other epoch has this number
-    carried = jax.vmap(
+    worlds = jax.vmap(
         lambda slot: reset_worlds(env, slot_key(slot, before, RESET), num_carried)
     )(joined)
+    learners = _carry(config, learners, slots, worlds)
 
-    def warm_up(carried: EnvState | None, segment: jax.Array):
+    def warm_up(learners: tuple[Learner, ...], segment: jax.Array):
         # Negative epochs: their keys are not those of any training epoch.
-        worlds, _, _ = _rollout(
-            env, agents, config, learners, slots, carried, -1 - segment
-        )
-        return carry_cohorts(worlds, config.num_worlds, segments, 1), None
+        worlds, _, _ = _rollout(env, agents, config, learners, slots, -1 - segment)
+        return _carry(config, learners, slots, worlds), None
 
-    carried, _ = jax.lax.scan(warm_up, carried, jnp.arange(segments - 1))
-    return carried
+    learners, _ = jax.lax.scan(warm_up, learners, jnp.arange(segments - 1))
+    return learners
+
+
+def final_episodes(
+    env: Env,
+    agents: Sequence[Agent],
+    config: TrainConfig,
+    learners: tuple[Learner, ...],
+    slots: tuple[Slot, ...],
+    num_rounds: int,
+) -> tuple[Metrics, ...]:
+    """What trained agents do in whole fresh episodes, with sampled actions.
+
+    With cohorts an epoch's episodes were begun by older policies; these were not. A
+    round is one episode of all k N worlds of a slot.
+
+    Returns:
+      For each group metrics [num_rounds, P_g]: `episode_metrics`, `awareness`, and the
+      environment's counters.
+    """
+    whole = dataclasses.replace(
+        config,
+        num_worlds=config.num_worlds * config.segments_per_episode,
+        segments_per_episode=1,
+    )
+    fresh = tuple(learner.replace(worlds=None) for learner in learners)
+
+    def play(carry: None, index: jax.Array):
+        epoch = config.num_epochs + index  # no epoch has this number
+        worlds, trajectory, start = _rollout(env, agents, whole, fresh, slots, epoch)
+        counts = _travelled(worlds, start)
+
+        def one(slot: Slot, trajectory: Trajectory, counts: Metrics) -> Metrics:
+            cost = trajectory.cost_inputs.cost
+            metrics = episode_metrics(trajectory, cost, env.episode_length)
+            metrics |= awareness(trajectory, slot.cost.theta)
+            return metrics | {name: jnp.mean(x) for name, x in counts.items()}
+
+        metrics = []
+        for slot, part in zip(slots, _parts(slots), strict=True):
+            mine = jax.tree.map(lambda x, part=part: x[:, part], trajectory)
+            mine_counts = jax.tree.map(lambda x, part=part: x[part], counts)
+            metrics.append(jax.vmap(one, in_axes=(0, 1, 0))(slot, mine, mine_counts))
+        return carry, tuple(metrics)
+
+    return jax.lax.scan(play, None, jnp.arange(num_rounds, dtype=jnp.int32))[1]
 
 
 def train(
@@ -184,17 +223,35 @@ def run_stage(
       Learners and for each group metrics [num_epochs, P_g].
     """
 
-    def body(carry, epoch: jax.Array):
-        learners, carried = carry
-        learners, carried, metrics = run_epoch(
-            env, agents, config, learners, slots, carried, epoch, bank
-        )
-        return (learners, carried), metrics
+    def body(learners: tuple[Learner, ...], epoch: jax.Array):
+        return run_epoch(env, agents, config, learners, slots, epoch, bank)
 
-    carried = init_worlds(env, agents, config, learners, slots)
+    learners = start_cohorts(env, agents, config, learners, slots)
     epochs = jnp.arange(config.num_epochs, dtype=jnp.int32)
-    (learners, _), metrics = jax.lax.scan(body, (learners, carried), epochs)
-    return learners, metrics
+    return jax.lax.scan(body, learners, epochs)
+
+
+def _carry(
+    config: TrainConfig,
+    learners: tuple[Learner, ...],
+    slots: tuple[Slot, ...],
+    worlds: EnvState,
+) -> tuple[Learner, ...]:
+    """Learners that take all cohorts but the oldest of [sum P_g, k N] worlds along."""
+    kept = carry_cohorts(worlds, config.num_worlds, config.segments_per_episode, 1)
+    return tuple(
+        learner.replace(worlds=jax.tree.map(lambda x, part=part: x[part], kept))
+        for learner, part in zip(learners, _parts(slots), strict=True)
+    )
+
+
+def _travelled(worlds: EnvState, start: EnvState) -> Metrics:
+    """The environment's counters from `start` on, float32."""
+    return jax.tree.map(
+        lambda end, begin: (end - begin).astype(jnp.float32),
+        worlds.metrics,
+        start.metrics,
+    )
 
 
 def _parts(slots: tuple[Slot, ...]) -> list[slice]:
@@ -212,7 +269,6 @@ def _rollout(
     config: TrainConfig,
     learners: tuple[Learner, ...],
     slots: tuple[Slot, ...],
-    carried: EnvState | None,
     epoch: jax.Array,
 ) -> tuple[EnvState, Trajectory, EnvState]:
     """All slots of all groups in one batch of worlds [sum P_g, k N, ...].
@@ -227,7 +283,11 @@ def _rollout(
     fresh = jax.vmap(lambda key: reset_worlds(env, key, config.num_worlds))(
         jnp.concatenate(keys(RESET))
     )
-    start = join_cohorts(fresh, carried, 1)
+    carried = [learner.worlds for learner in learners]
+    older = None
+    if carried[0] is not None:
+        older = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *carried)
+    start = join_cohorts(fresh, older, 1)
     act_keys, parts = keys(ACT), _parts(slots)
 
     def act(obs: jax.Array, t: jax.Array) -> jax.Array:
