@@ -47,13 +47,14 @@ ORDER = (
     "render",
     "run",
     "methods",
+    "bench",
     "commandline",
     "evolve",
     "cli",
     "interop.*",
 )
 MAY_PRINT = {"evolve", "cli", "progress", "commandline"}
-MAY_JIT = {"population"}
+MAY_JIT = {"population", "bench"}
 # Closures over one agent's configuration, read from top to bottom.
 LONG_FUNCTIONS = {
     "agents.fisher.mlp_fisher_product",

@@ -121,6 +121,7 @@ BAD = {
         "segments_per_episode": (*COUNT, 3),  # does not divide 1000 steps
         "num_epochs": COUNT,
         "chunk_epochs": (*COUNT, 2),  # does not divide 333 epochs
+        "population_chunk": (-1, 0.5),
     },
     SearchConfig: {
         "seed": (-1, 2**32, 0.5),

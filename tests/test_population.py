@@ -338,6 +338,27 @@ def test_cohorts_travel_with_their_learners():
     assert len(np.unique(final[0]["ep_return"])) == 3 * SIZE  # fresh ones each round
 
 
+def test_slots_that_learn_in_turns_learn_the_same(program):
+    """Also where the last turn has fewer; and less memory is needed."""
+    env = make_toy_env()
+    config = train_config(population_chunk=3)
+    in_turns = make_population(env, make_agents(ALGORITHMS, config, env), config)
+    got, expected = (run(each, groups(), epochs=1) for each in (in_turns, program))
+    pairs = zip(
+        jax.tree.leaves(stable(got)), jax.tree.leaves(stable(expected)), strict=True
+    )
+    for one, all_ in pairs:
+        np.testing.assert_allclose(one, all_, rtol=ONE_UPDATE, atol=ONE_UPDATE)
+
+    def workspace(population):
+        compiled = population.compile(population.init(groups()), groups())
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    assert workspace(in_turns) < workspace(
+        make_population(env, make_agents(ALGORITHMS, TRAIN, env), TRAIN)
+    )
+
+
 def test_candidates_share_their_random_numbers(key):
     slots = candidate_slots(groups()[0].cost, key)
     assert slots.key.shape == slots.constrained.shape == (SIZE,)

@@ -1,4 +1,4 @@
-"""`autocost`: train, evaluate, render, report, envs, info."""
+"""`autocost`: train, evaluate, render, report, envs, bench, info."""
 
 import json
 import sys
@@ -26,6 +26,7 @@ commands:
   render    replay an episode of a policy: an HTML page, and a film if asked for
   report    write a search's HTML report again
   envs      a picture and the facts of every world
+  bench     how fast worlds step and agents learn on this machine
   info      versions, devices, environments, presets; or a run directory's facts
 
 `autocost COMMAND --help` lists the flags; the search itself is
@@ -38,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     argv = list(sys.argv[1:] if argv is None else argv)
     quiet()
     commands = {"train": _train, "evaluate": _evaluate, "render": _render}
-    commands |= {"report": _report, "envs": _envs, "info": _info}
+    commands |= {"report": _report, "envs": _envs, "bench": _bench, "info": _info}
     if not argv or argv[0] in ("-h", "--help"):
         print(HELP, end="")
         raise SystemExit(0 if argv else BAD_INPUT)
@@ -306,6 +307,57 @@ def _envs(argv: list[str]) -> None:
     if gallery.hint is not None:
         print(f"drawn from above: {gallery.hint}")
     print(f"{len(gallery.pictures)} pictures; open {gallery.index}")
+
+
+def _bench(argv: list[str]) -> None:
+    @dataclass(frozen=True)
+    class Options:
+        """How fast worlds step and agents learn; compiles are cold.
+
+        Attributes:
+          preset: whose program is timed.
+          envs: worlds whose steps are timed; default: the paper's, in MJX and in
+            closed form.
+          batch: of these worlds.
+          devices: devices to use; default: all; a CPU counts one a core.
+          json: file to write the rows to.
+        """
+
+        preset: Literal["laptop", "search", "paper", "smoke"] = "laptop"
+        envs: tuple[str, ...] = ()
+        batch: int = 1024
+        devices: int | None = None
+        json: Path | None = None
+
+    options = parse(Options, argv, "autocost bench")
+    devices = use_devices(options.devices)  # before anything of JAX runs
+    from autocost_jax.arrays import write_atomic
+    from autocost_jax.bench import bench
+    from autocost_jax.config import preset
+    from autocost_jax.env_config import EnvConfig, env_config
+    from autocost_jax.store import run_facts
+
+    if options.batch < 1 or options.batch % len(devices):
+        count = len(devices)
+        raise ValueError(f"batch must be a multiple of {count}, got {options.batch}")
+    envs = [env_config(name) for name in options.envs]
+    envs = envs or [EnvConfig(), EnvConfig(physics="closed_form")]
+    facts, rows = run_facts(), []
+    facts.pop("seed")
+    print(f"{len(devices)} device(s) of kind {devices[0].device_kind}", flush=True)
+    print(f"{'':46}{'worlds':>8}{'compile s':>11}{'MB':>7}{'env steps/s':>13}")
+    for row in bench(preset(options.preset), envs, options.batch, devices):
+        rows.append(row._asdict())
+        print(
+            f"{row.env + ', ' + row.physics + ': ' + row.what:46}{row.worlds:>8}"
+            f"{row.compile_seconds:>11.1f}{row.workspace_bytes / 1e6:>7.0f}"
+            f"{row.env_steps_per_second:>13,}",
+            flush=True,
+        )
+    if options.json is not None:
+        command = " ".join(["autocost bench", *argv])
+        result = {"command": command, "facts": facts, "rows": rows}
+        write_atomic(options.json, json.dumps(result, indent=1).encode() + b"\n")
 
 
 def _info(argv: list[str]) -> None:

@@ -100,7 +100,9 @@ class TrainConfig:
     An epoch of a slot is `num_worlds` x `env.num_steps` steps. With
     `segments_per_episode` = k > 1 the slot has k cohorts of `num_worlds` worlds and
     an epoch is `env.num_steps` / k steps long; k = 1 is the paper.
-    `chunk_epochs` epochs run in one jitted call.
+    `chunk_epochs` epochs run in one jitted call. `population_chunk` bounds the memory
+    of updates: so many slots of an algorithm learn at once on a device, the others
+    after them; 0 for all at once. The numbers do not depend on it.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -109,11 +111,15 @@ class TrainConfig:
     segments_per_episode: int = 1
     num_epochs: int = 333
     chunk_epochs: int = 1
+    population_chunk: int = 0
 
     def __post_init__(self) -> None:
         require_counts(
             self, "num_worlds", "segments_per_episode", "num_epochs", "chunk_epochs"
         )
+        chunk = self.population_chunk
+        ok = is_integer(chunk) and chunk >= 0
+        require(ok, "population_chunk", "an integer >= 0", chunk)
         k, steps = self.segments_per_episode, self.env.num_steps
         require(
             steps % k == 0, "segments_per_episode", f"a divisor of num_steps={steps}", k

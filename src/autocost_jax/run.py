@@ -53,8 +53,11 @@ def estimate_memory(config: SearchConfig, num_devices: int) -> int:
     width = max(config.train.agent.hidden_sizes, default=0)
     batch = rows // config.train.agent.value_minibatches
     activations = 4 * batch * width * len(config.train.agent.hidden_sizes)
-    per_slot = 2 * row * rows + activations + 4 * 3 * 3 * weights
-    return 4 * per_slot * -(-slots // num_devices)
+    per_slot = 2 * row * rows + 4 * 3 * 3 * weights
+    here = -(-slots // num_devices)
+    at_once = -(-config.population_size // num_devices)
+    at_once = min(config.train.population_chunk or at_once, at_once)
+    return 4 * (per_slot * here + activations * at_once)
 
 
 def estimate_disk(config: SearchConfig) -> int:
@@ -106,8 +109,8 @@ def check_memory(config: SearchConfig, devices: Sequence[Any]) -> None:
     if limit is not None and need > limit:
         raise ValueError(
             f"the run needs about {need / 1e9:.1f} GB on each device, which has "
-            f"{limit / 1e9:.1f} GB: lower population_size or num_worlds, or use more "
-            "devices"
+            f"{limit / 1e9:.1f} GB: set population_chunk, lower population_size or "
+            "num_worlds, or use more devices"
         )
 
 

@@ -5,7 +5,7 @@ population share one rollout, so the physics is traced, compiled and stepped onc
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -96,11 +96,12 @@ def run_epoch(
                 env, agent, config, learner, slot, trajectory, counts, epoch, bank
             )
 
-        group_trajectory = jax.tree.map(lambda x, part=part: x[:, part], trajectory)
-        counts = jax.tree.map(lambda x, part=part: x[part], travelled)
-        learned, group_metrics = jax.vmap(update, in_axes=(0, 0, 1, 0))(
-            learner.replace(worlds=None), slot, group_trajectory, counts
+        group_trajectory = jax.tree.map(
+            lambda x, part=part: jnp.moveaxis(x[:, part], 1, 0), trajectory
         )
+        counts = jax.tree.map(lambda x, part=part: x[part], travelled)
+        inputs = (learner.replace(worlds=None), slot, group_trajectory, counts)
+        learned, group_metrics = _map_slots(config.population_chunk, update, inputs)
         after.append(learned.replace(worlds=learner.worlds))
         metrics.append(group_metrics)
     return tuple(after), tuple(metrics)
@@ -243,6 +244,13 @@ def _carry(
         learner.replace(worlds=jax.tree.map(lambda x, part=part: x[part], kept))
         for learner, part in zip(learners, _parts(slots), strict=True)
     )
+
+
+def _map_slots(chunk: int, function: Callable[..., Any], inputs: Any) -> Any:
+    """`function` of each slot of inputs [P, ...], `chunk` slots at once; 0 for all."""
+    if not 0 < chunk < jax.tree.leaves(inputs)[0].shape[0]:
+        return jax.vmap(function)(*inputs)
+    return jax.lax.map(lambda slot: function(*slot), inputs, batch_size=chunk)
 
 
 def _travelled(worlds: EnvState, start: EnvState) -> Metrics:
