@@ -1,99 +1,82 @@
-"""How fast a preset's program compiles and runs, with and without updates.
+"""How fast a preset's program compiles and runs; one program against many.
 
     python benchmarks/population.py --preset laptop
 
-Rollout alone is the same program with agents whose update does nothing. Steady state
-is the best of five chunks, apart from the compile, and on the devices that
-`autocost_jax.evolve` would use. Writes benchmarks/results/population_PRESET.json.
+See `autocost_jax.bench`: the search's program with and without updates, and one
+algorithm's programs of 1 to 16 slots, on at most one device a slot. Writes
+benchmarks/results/population_PRESET.json and the table of it.
 """
 
 import argparse
+import dataclasses
 import json
-import time
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
-from autocost_jax import PRESETS, make_env, make_population, preset
+from autocost_jax import PRESETS, preset
+from autocost_jax.bench import Speed, search_speeds, slot_speeds
 from autocost_jax.commandline import use_devices
-from autocost_jax.evolution import init_search, make_searcher
-from autocost_jax.population import make_agents
+from autocost_jax.config import SearchConfig
 from autocost_jax.store import run_facts
 
-REPEATS = 5
+RESULTS = Path(__file__).parent / "results"
+SIZES = (1, 4, 16)
+# Env steps a second of one omnisafe 0.5.0 run, nets 64-64, updates included, on two
+# such cores; measured once, apart from this script, which cannot install it.
+OMNISAFE = {"ppo_lagrangian": 90, "cpo": 199}
 
 
-def measure(population: Any, slots: Any, steps: int) -> dict[str, float]:
-    """Seconds of compiling and of one chunk, and env steps a second."""
-    learners = population.init(slots)
-    start = time.perf_counter()
-    population.compile(learners, slots)
-    compile_seconds = time.perf_counter() - start
-    best = float("inf")
-    for epoch in range(REPEATS + 1):  # the first warms up
-        start = time.perf_counter()
-        learners, metrics = population.chunk(learners, slots, epoch)
-        jax.block_until_ready((learners, metrics))
-        if epoch:
-            best = min(best, time.perf_counter() - start)
-    return {
-        "compile_seconds": round(compile_seconds, 2),
-        "chunk_seconds": round(best, 3),
-        "env_steps_per_second": round(steps / best),
-    }
+def render(result: dict[str, Any]) -> str:
+    """The table of the README."""
+    lines = ["| program | worlds | cold compile | env steps/s |", "|---|---|---|---|"]
+    lines += [
+        f"| {row['what']}, {row['physics'].replace('_', ' ')} | {row['worlds']} | "
+        f"{row['compile_seconds']:.1f} s | {row['env_steps_per_second']:,} |"
+        for row in result["rows"]
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def with_physics(config: SearchConfig, physics: Any) -> SearchConfig:
+    """The same search with another model of the world."""
+    env = dataclasses.replace(config.train.env, physics=physics)
+    train = dataclasses.replace(config.train, env=env)
+    return dataclasses.replace(config, train=train)
 
 
 def main() -> None:
-    """Measure, print one table, write one JSON."""
+    """Measure, print rows, write JSON and table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--preset", choices=PRESETS, default="laptop")
     parser.add_argument("--devices", type=int, default=None)
     options = parser.parse_args()
     devices = use_devices(options.devices)
     config = preset(options.preset)
-    train = config.train
-    chunk = train.chunk_epochs * train.num_worlds * train.env.num_steps
-    steps = chunk * config.population_size * len(config.algorithms)
+    fast = with_physics(config, "closed_form")
+    rows: list[Speed] = []
 
-    start = time.perf_counter()
-    searcher = make_searcher(config, devices)
-    state = init_search(searcher)
-    jax.block_until_ready(state.learners)
-    init_seconds = time.perf_counter() - start
-    slots = searcher.stage.slots(0, state.candidates)
+    def keep(new: list[Speed]) -> None:
+        for row in new:
+            print(json.dumps(row._asdict()), flush=True)
+        rows.extend(new)
 
-    env = make_env(train.env)
-    agents = make_agents(config.algorithms, train, env)
-    still = tuple(
-        agent._replace(update=lambda state, *_: (state, {"idle": jnp.zeros(())}))
-        for agent in agents
-    )
-    rows = {
-        "with updates": measure(searcher.population, slots, steps),
-        "rollout alone": measure(
-            make_population(env, still, train, devices=devices), slots, steps
-        ),
-    }
+    keep(search_speeds(config, devices))
+    keep(search_speeds(fast, devices))
+    for algorithm in config.algorithms:
+        keep(slot_speeds(fast.train, algorithm, SIZES, devices))
+    facts = run_facts()
+    facts.pop("seed")
     result = {
         "command": f"python benchmarks/population.py --preset {options.preset}",
-        "facts": run_facts(),
-        "init_seconds": round(init_seconds, 2),
-        "slots": config.population_size * len(config.algorithms),
-        "worlds": config.population_size * len(config.algorithms) * train.num_worlds,
-        "rows": rows,
+        "facts": facts,
+        "devices": len(devices),
+        "omnisafe": OMNISAFE,
+        "rows": [row._asdict() for row in rows],
     }
-    print(f"{options.preset}: {result['worlds']} worlds on {len(devices)} device(s)")
-    print(f"{'':16}{'compile s':>10}{'chunk s':>10}{'env steps/s':>14}")
-    for name, row in rows.items():
-        print(
-            f"{name:16}{row['compile_seconds']:>10.1f}{row['chunk_seconds']:>10.2f}"
-            f"{row['env_steps_per_second']:>14,}"
-        )
-    file = Path("benchmarks/results") / f"population_{options.preset}.json"
+    file = RESULTS / f"population_{options.preset}.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(result, indent=1) + "\n")
+    file.with_suffix(".md").write_text(render(result))
 
 
 if __name__ == "__main__":
