@@ -20,6 +20,7 @@ MAX_FUNCTION, MAX_MODULE = 60, 350  # lines that are not docstring
 ORDER = (
     "records",
     "arrays",
+    "cluster",
     "checks",
     "env_config",
     "config",

@@ -71,7 +71,10 @@ def with_env(train: TrainConfig, argv: Sequence[str]) -> TrainConfig:
 
 def fail(message: str, status: int = BAD_INPUT) -> None:
     """End the program with one line on stderr."""
+    from autocost_jax.cluster import leave
+
     sys.stderr.write(" ".join(message.split()) + "\n")
+    leave(status)
     raise SystemExit(status)
 
 
@@ -130,23 +133,36 @@ def use_compile_cache(is_wanted: bool) -> Path | None:
     return path
 
 
-def use_devices(count: int | None) -> Sequence[Any]:
+def use_devices(
+    count: int | None,
+    coordinator: str | None = None,
+    num_processes: int | None = None,
+    process_id: int | None = None,
+) -> Sequence[Any]:
     """The devices a run uses; on a CPU one for each core unless told otherwise.
 
     Must be called before anything of JAX has run: a CPU is split into devices then.
 
     Args:
       count: number of devices, None for all.
+      coordinator: see `cluster.join`, as the next two.
+      num_processes: of the run.
+      process_id: of this process.
 
     Raises:
-      ValueError: if there are fewer.
+      ValueError: if there are fewer, or if the processes are not well described.
     """
     import jax
+
+    from autocost_jax import cluster
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     with contextlib.suppress(RuntimeError):  # too late to split: take what is there
         jax.config.update("jax_num_cpu_devices", cores)
+    cluster.join(coordinator, num_processes, process_id)
     devices = jax.devices()
+    if coordinator is not None and count is not None:
+        raise ValueError("devices cannot be chosen in a run of several processes")
     if count is not None and not 1 <= count <= len(devices):
         raise ValueError(f"devices must be in [1, {len(devices)}], got {count}")
     return devices[:count]

@@ -351,6 +351,7 @@ def _run_chunk(searcher: Searcher, state: SearchState) -> tuple[SearchState, Pro
     stage, epoch = int(state.stage), int(state.epoch)
     slots = functions.slots(stage, state.candidates)
     learners, metrics = searcher.population.chunk(state.learners, slots, epoch)
+    metrics = searcher.population.fetch(metrics)
     history = functions.record(state.history, metrics, epoch)
     after = epoch + config.train.chunk_epochs
     progress = Progress(stage, epoch, jax.tree.map(np.asarray, metrics))
@@ -359,9 +360,10 @@ def _run_chunk(searcher: Searcher, state: SearchState) -> tuple[SearchState, Pro
     )
     if after < config.train.num_epochs:
         return state, progress
-    frozen = jnp.stack([group.frozen for group in learners])
+    fetch = searcher.population.fetch
+    frozen = jnp.stack([fetch(group.frozen) for group in learners])
     if config.final_rounds:
-        history = _tracked(searcher.population.final(learners, slots))
+        history = _tracked(fetch(searcher.population.final(learners, slots)))
     es_state, result = functions.end(state.es, stage, state.candidates, history, frozen)
     progress = progress._replace(result=result, learners=learners)
     if stage + 1 < config.num_stages:

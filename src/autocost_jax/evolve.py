@@ -42,7 +42,9 @@ def _main(argv: list[str]) -> None:
     defaults = _defaults(argv)
     options = parse(_options_type(), argv, PROG, default=defaults, description=__doc__)
     use_compile_cache(options.compile_cache)
-    devices = use_devices(options.devices)  # before anything of JAX runs
+    # Before anything of JAX runs:
+    group = (options.coordinator, options.num_processes, options.process_id)
+    devices = use_devices(options.devices, *group)
     config = options.search
     from autocost_jax.run import describe, run_search
 
@@ -79,6 +81,10 @@ def _options_type() -> Any:
           resume: continue the run in `out` from its newest checkpoint.
           overwrite: start over in a directory that already holds a run.
           devices: devices to use; default: all; a CPU counts one a core.
+          coordinator: of a run in several processes, HOST:PORT of the first one, or
+            auto under SLURM and the like; start the command once for each of them.
+          num_processes: of such a run; leave out with auto.
+          process_id: of this one, from 0; leave out with auto.
           compile_cache: keep compiled programs in the user's cache directory.
           dry_run: say what would be done, and stop.
           eval_episodes: fresh episodes in which the best cost's agents are scored.
@@ -92,6 +98,9 @@ def _options_type() -> Any:
         resume: bool = False
         overwrite: bool = False
         devices: int | None = None
+        coordinator: str | None = None
+        num_processes: int | None = None
+        process_id: int | None = None
         compile_cache: bool = True
         dry_run: bool = False
         eval_episodes: int = 100

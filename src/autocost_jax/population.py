@@ -18,6 +18,7 @@ from jax.sharding import PartitionSpec as P
 from autocost_jax.agents.base import Agent
 from autocost_jax.agents.cpo import cpo
 from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
+from autocost_jax.arrays import is_key
 from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import BANK, CostTerm
 from autocost_jax.envs.env import Env
@@ -47,6 +48,7 @@ class Population(NamedTuple):
       chunk: (learners, slots, epoch) -> (learners, metrics [K, P_g] a group); the
         learners passed in are donated.
       compile: (learners, slots) -> None, compiles `chunk` ahead of its first call.
+      fetch: stacked pytree -> the same in the memory of every process.
       num_devices: devices it runs on.
     """
 
@@ -54,6 +56,7 @@ class Population(NamedTuple):
     final: Callable[..., tuple[Metrics, ...]]
     chunk: Callable[..., tuple[tuple[Learner, ...], tuple[Metrics, ...]]]
     compile: Callable[[tuple[Learner, ...], tuple[Slot, ...]], Any]
+    fetch: Callable[[Any], Any]
     num_devices: int
 
 
@@ -148,7 +151,9 @@ def make_population(
         metrics = final_fn(_pad(learners, mesh), _pad(slots, mesh))
         return _unpad_metrics(metrics, _sizes(slots))
 
-    return Population(init, final, chunk, compile_, mesh.size)
+    return Population(
+        init, final, chunk, compile_, lambda tree: _fetch(tree, mesh), mesh.size
+    )
 
 
 def make_evaluator(
@@ -221,22 +226,57 @@ def _sizes(groups: tuple[Slot, ...]) -> list[int]:
 
 def _pad(groups: tuple[Any, ...], mesh: Mesh) -> tuple[Any, ...]:
     """Each group filled up with copies of its first slot, laid over the devices."""
+    split = NamedSharding(mesh, P(AXIS))
+
+    def fill(leaf: jax.Array) -> jax.Array:
+        missing = -leaf.shape[0] % mesh.size
+        if not missing:
+            return leaf
+        filler = jnp.broadcast_to(leaf[:1], (missing, *leaf.shape[1:]))
+        return jnp.concatenate([leaf, filler])
 
     def pad(leaf: jax.Array) -> jax.Array:
-        missing = -leaf.shape[0] % mesh.size
-        if missing:
-            filler = jnp.broadcast_to(leaf[:1], (missing, *leaf.shape[1:]))
-            leaf = jnp.concatenate([leaf, filler])
-        return jax.device_put(leaf, NamedSharding(mesh, P(AXIS)))
+        if split.is_fully_addressable:
+            return jax.device_put(fill(leaf), split)
+        if not leaf.is_fully_addressable:  # from an earlier call of the program
+            return jax.jit(fill, out_shardings=split)(leaf)
+        if is_key(leaf):
+            data = pad(jax.random.key_data(leaf))
+            return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
+        value = np.asarray(fill(leaf))  # the same in every process, which takes its own
+        return jax.make_array_from_callback(
+            value.shape, split, lambda index: value[index]
+        )
 
     return tuple(jax.tree.map(pad, group) for group in groups)
 
 
 def _unpad(groups: tuple[Any, ...], sizes: list[int]) -> tuple[Any, ...]:
     return tuple(
-        jax.tree.map(lambda leaf, size=size: leaf[:size], group)
+        jax.tree.map(
+            lambda leaf, size=size: leaf[:size] if leaf.shape[0] > size else leaf, group
+        )
         for group, size in zip(groups, sizes, strict=True)
     )
+
+
+def _fetch(tree: Any, mesh: Mesh) -> Any:
+    """A tree as it is, where one process sees all devices; else copied to the host."""
+    if NamedSharding(mesh, P()).is_fully_addressable:
+        return tree
+    data = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, tree)
+    everywhere = NamedSharding(mesh, P())
+    data = jax.jit(lambda tree: tree, out_shardings=everywhere)(data)
+
+    def take(value: jax.Array, like: jax.Array) -> Any:
+        host = np.asarray(value)
+        if not is_key(like):
+            return host
+        return jax.random.wrap_key_data(
+            jnp.asarray(host), impl=jax.random.key_impl(like)
+        )
+
+    return jax.tree.map(take, data, tree)
 
 
 def _unpad_metrics(

@@ -1,5 +1,6 @@
 """One search in a run directory: watched, checkpointed, resumed, reported."""
 
+import io
 import itertools
 import os
 import sys
@@ -11,6 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from autocost_jax import cluster
 from autocost_jax.arrays import flatten
 from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import make_env
@@ -35,7 +37,12 @@ from autocost_jax.policies import (
 from autocost_jax.population import make_evaluator
 from autocost_jax.progress import Display, format_seconds, summarise
 from autocost_jax.scene import first_recording, watch_first
-from autocost_jax.store import RunDir, check_free_space, estimate_bytes
+from autocost_jax.store import (
+    RunDir,
+    SilentRun,
+    check_free_space,
+    estimate_bytes,
+)
 
 
 def estimate_memory(config: SearchConfig, num_devices: int) -> int:
@@ -100,11 +107,11 @@ def check_memory(config: SearchConfig, devices: Sequence[Any]) -> None:
     Raises:
       ValueError: with the estimate and what the device has, if it tells.
     """
-    stats = devices[0].memory_stats() or {}
+    stats = jax.local_devices()[0].memory_stats() or {}
     limit = stats.get("bytes_limit")
     if devices[0].platform == "cpu":  # its devices share the machine's memory
         machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        limit = machine // len(devices)
+        limit = machine // len(jax.local_devices())
     need = estimate_memory(config, len(devices))
     if limit is not None and need > limit:
         raise ValueError(
@@ -145,36 +152,50 @@ def run_search(
     require_episodes(num_episodes)
     # A device without a candidate of its own would only train copies.
     devices = list(devices or jax.devices()[:1])[: config.population_size]
+    if len({device.process_index for device in devices}) < jax.process_count():
+        raise ValueError(
+            f"{jax.process_count()} processes are more than the "
+            f"{config.population_size} candidates can be dealt to"
+        )
     check_memory(config, devices)
     searcher = make_searcher(config, devices)
-    if resume:
+    if not cluster.is_first():
+        run = SilentRun(path, config)
+    elif resume:
         run = RunDir.open(path, config)
     else:
         run = RunDir.create(path, config, overwrite=overwrite)
     total = config.env_steps
-    with run, Display(total, 0, sys.stdout) as display:
+    stream = sys.stdout if cluster.is_first() else io.StringIO()
+    with run, Display(total, 0, stream) as display:
         for line in [*run.warnings, *describe(config, len(devices))]:
             display.say(line)
         state = _start(run, searcher, display, resume)
         if int(state.stage) < config.num_stages:
             _compile(searcher, state, display)
         state = _train(run, searcher, state, display)
-        return _finish(run, searcher, state, display, num_episodes)
+        if isinstance(run, RunDir):
+            _finish(run, searcher, state, display, num_episodes)
+        cluster.wait_for_all()
+        return path / "report" / "index.html"
 
 
 def _start(
-    run: RunDir, searcher: Searcher, display: Display, resume: bool
+    run: RunDir | SilentRun, searcher: Searcher, display: Display, resume: bool
 ) -> SearchState:
     state = init_search(searcher)
-    check_free_space(run.path, 4 * estimate_bytes(state))
+    if cluster.is_first():
+        check_free_space(run.path, 4 * estimate_bytes(state))
     step = None
     if resume:
         checkpoint = run.resume(state)
-        if checkpoint is None:
+        found = cluster.share(checkpoint and checkpoint.tree, state)
+        if found is None:
             display.say(f"{run.path} has no checkpoint yet: starting again")
         else:
-            state, step = checkpoint.tree, checkpoint.step
-            for line in checkpoint.warnings:
+            state = found
+            step = checkpoint.step if checkpoint else None
+            for line in checkpoint.warnings if checkpoint else ():
                 display.say(line)
             done = f"{int(state.stage)} stages and {int(state.epoch)} epochs"
             display.say(f"resuming {run.path} after {done}")
@@ -201,7 +222,7 @@ def _steps_done(config: SearchConfig, state: SearchState) -> int:
 
 
 def _train(
-    run: RunDir, searcher: Searcher, state: SearchState, display: Display
+    run: RunDir | SilentRun, searcher: Searcher, state: SearchState, display: Display
 ) -> SearchState:
     config = run.config
     chunk = config.train.chunk_epochs
@@ -229,12 +250,13 @@ def _train(
         if progress.result is not None:
             _write_stage(run, searcher, state, progress, progress.result)
         position = {"stage": int(state.stage), "epoch": int(state.epoch)}
-        run.save_checkpoint(state, first + chunk, position)
+        saved = state.replace(learners=searcher.population.fetch(state.learners))
+        run.save_checkpoint(saved, first + chunk, position)
     return state
 
 
 def _write_stage(
-    run: RunDir,
+    run: RunDir | SilentRun,
     searcher: Searcher,
     state: SearchState,
     progress: Progress,
@@ -260,7 +282,8 @@ def _write_stage(
     run.write_stage(progress.stage, arrays)
     top = int(result.order[0])
     for name, learner in zip(config.algorithms, progress.learners, strict=True):
-        params = jax.tree.map(lambda leaf: leaf[top], learner.agent.policy)
+        policies = searcher.population.fetch(learner.agent.policy)
+        params = jax.tree.map(lambda leaf: leaf[top], policies)
         run.write_policy(policy_name(progress.stage, name), flatten(params))
 
 

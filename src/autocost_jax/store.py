@@ -63,6 +63,7 @@ __all__ = [
     "DiskFullError",
     "RunDir",
     "RunDirError",
+    "SilentRun",
     "check_free_space",
     "config_hash",
     "estimate_bytes",
@@ -335,6 +336,48 @@ class RunDir:
             if self._metrics is not None:
                 os.fsync(self._metrics.fileno())
             return file.stat().st_size if file.exists() else 0
+
+
+class SilentRun:
+    """What a `RunDir` is to a process that leaves the writing to the first.
+
+    Attributes:
+      path: the run directory, which is not touched.
+      config: the run's configuration.
+      warnings: none.
+    """
+
+    def __init__(self, path: Path, config: Any) -> None:
+        self.path = path
+        self.config = config
+        self.warnings: list[str] = []
+
+    def __enter__(self) -> Self:
+        """Return the run itself."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """There is nothing to close."""
+
+    def resume(self, template: Any) -> None:
+        """Nothing is read either; `cluster.share` tells what the first one read."""
+
+    def start_tensorboard(self, purge_step: int | None = None) -> None:
+        """Nothing is written."""
+
+    def log_metrics(self, row: Mapping[str, Any], step: int) -> None:
+        """Nothing is written."""
+
+    def save_checkpoint(
+        self, tree: Any, step: int, extra: dict[str, Any] | None = None
+    ) -> None:
+        """Nothing is written."""
+
+    def write_stage(self, stage: int, arrays: Mapping[str, Any]) -> None:
+        """Nothing is written."""
+
+    def write_policy(self, name: str, params: Any) -> None:
+        """Nothing is written."""
 
 
 def _run_files(path: Path) -> list[Path]:

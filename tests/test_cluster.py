@@ -1,0 +1,139 @@
+"""One search in two processes on this machine: the same run, and a clear end."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from autocost_jax import cluster
+from autocost_jax.store import read_metrics
+
+FLAGS = ["--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "4"]
+WAIT = 400  # seconds until a process counts as hung
+NUMBERS = ("theta", "cost", "ep_return", "order", "elites", "archive")
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """Processes share a compilation cache."""
+    cache = str(tmp_path_factory.mktemp("cache"))
+    return os.environ | {"JAX_COMPILATION_CACHE_DIR": cache}
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
+
+
+def on_core(index: int):
+    """One core, which is one device, for a process of several."""
+    cores = sorted(os.sched_getaffinity(0))
+    return lambda: os.sched_setaffinity(0, {cores[index % len(cores)]})
+
+
+def start(out: Path, environment, *flags: str, index: int | None = None, port: int = 0):
+    words = [sys.executable, "-m", "autocost_jax.evolve", "--out", str(out), *flags]
+    if index is not None:
+        words += ["--coordinator", f"127.0.0.1:{port}"]
+        words += ["--num-processes", "2", "--process-id", str(index)]
+    return subprocess.Popen(
+        words,
+        env=environment,
+        preexec_fn=None if index is None else on_core(index),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def start_both(out: Path, environment, *flags: str):
+    port = free_port()
+    return [
+        start(out, environment, *flags, index=index, port=port) for index in range(2)
+    ]
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory, environment):
+    """A run in two processes: its directory and what each of them said."""
+    out = tmp_path_factory.mktemp("runs") / "both"
+    processes = start_both(out, environment, *FLAGS)
+    said = [process.communicate(timeout=WAIT)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], said
+    return out, said
+
+
+def test_only_the_first_process_speaks_and_writes(both):
+    out, (first, second) = both
+    assert "open " in first
+    lines = [line for line in second.splitlines() if not line.startswith("[Gloo]")]
+    assert lines == []
+    assert (out / "report" / "index.html").exists()
+    assert len(read_metrics(out)) == 4  # one row an epoch, not two
+
+
+def test_it_is_the_search_of_one_process(both, environment, tmp_path):
+    """The same slots on two devices of one process; sums in the same order."""
+    process = start(tmp_path / "one", environment, *FLAGS, "--devices", "2")
+    said, _ = process.communicate(timeout=WAIT)
+    if "devices must be in [1, 1]" in said:
+        pytest.skip("one core")
+    assert process.returncode == 0, said
+    for name in ("stage_00.npz", "stage_01.npz"):
+        one, two = np.load(tmp_path / "one" / name), np.load(both[0] / name)
+        for key in NUMBERS:
+            np.testing.assert_allclose(
+                two[key], one[key], rtol=1e-4, atol=1e-5, err_msg=f"{name} {key}"
+            )
+
+
+def test_a_crash_ends_the_others_and_one_process_can_go_on(environment, tmp_path):
+    """In one line and soon; then the run is resumed on another number of devices."""
+    out = tmp_path / "crashed"
+    first, second = start_both(out, environment, *FLAGS, "--num-epochs", "60")
+    deadline = time.monotonic() + WAIT
+    while not list(out.glob("checkpoints/step_*")):
+        assert first.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    second.send_signal(signal.SIGKILL)
+    second.communicate()
+    said, _ = first.communicate(timeout=60)
+    assert first.returncode == 1, said
+    assert said.splitlines()[-1].startswith("python -m autocost_jax.evolve: ")
+    flags = ("--resume", "--devices", "1", "--eval-episodes", "4")
+    resumed = start(out, environment, *flags)
+    said, _ = resumed.communicate(timeout=WAIT)
+    assert resumed.returncode == 0, said
+    assert "resuming" in said
+    assert [row["step"] for row in read_metrics(out)] == list(range(120))
+
+
+@pytest.mark.parametrize(
+    ("words", "given"),
+    [
+        ("need a coordinator", (None, 2, None)),
+        ("leave out", ("auto", 2, 0)),
+        ("needs num_processes", ("127.0.0.1:1", None, 0)),
+        ("process_id", ("127.0.0.1:1", 2, 2)),
+        ("HOST:PORT", ("127.0.0.1", 2, 0)),
+    ],
+)
+def test_incomplete_descriptions_are_refused(words, given):
+    with pytest.raises(ValueError, match=words):
+        cluster.join(*given)
+
+
+def test_alone_everything_is_shared():
+    tree = {"a": np.arange(3)}
+    assert cluster.share(tree, tree) is tree
+    assert cluster.share(None, tree) is None
+    assert cluster.is_first()
+    cluster.wait_for_all()
