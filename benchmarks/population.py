@@ -28,12 +28,19 @@ OMNISAFE = {"ppo_lagrangian": 90, "cpo": 199}
 
 def render(result: dict[str, Any]) -> str:
     """The table of the README."""
-    lines = ["| program | worlds | cold compile | env steps/s |", "|---|---|---|---|"]
-    lines += [
-        f"| {row['what']}, {row['physics'].replace('_', ' ')} | {row['worlds']} | "
-        f"{row['compile_seconds']:.1f} s | {row['env_steps_per_second']:,} |"
-        for row in result["rows"]
+    lines = [
+        "| program | worlds | cold compile | env steps/s | one omnisafe run |",
+        "|---|---|---|---|---|",
     ]
+    for row in result["rows"]:
+        rate = result["omnisafe"].get(row["what"].partition(",")[0])
+        ratio = f"{row['env_steps_per_second'] / rate:,.0f} x" if rate else ""
+        lines.append(
+            f"| {row['what'].replace(', 1 slots', ', 1 slot').replace('_', '-')}, "
+            f"{row['physics'].replace('_', ' ')} | {row['worlds']} | "
+            f"{row['compile_seconds']:.1f} s | {row['env_steps_per_second']:,} | "
+            f"{ratio} |"
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -152,8 +152,15 @@ def test_the_speeds_are_those_of_the_committed_json(name):
 
 @pytest.mark.parametrize(
     "flag",
-    ["--physics", "--no-compile-cache", "--segments-per-episode", "--population-chunk"]
-    + ["--coordinator", "--num-processes", "--process-id"],
+    [
+        "--physics",
+        "--no-compile-cache",
+        "--segments-per-episode",
+        "--population-chunk",
+        "--coordinator",
+        "--num-processes",
+        "--process-id",
+    ],
 )
 def test_flags_of_the_readme_exist(flag, capsys):
     with pytest.raises(SystemExit):
