@@ -1,6 +1,7 @@
 """How fast a preset's program compiles and runs; one program against many.
 
     python benchmarks/population.py --preset laptop
+    python benchmarks/population.py --preset paper --parts mjx closed_form
 
 See `autocost_jax.bench`: the search's program with and without updates, and one
 algorithm's programs of 1 to 16 slots, on at most one device a slot. Writes
@@ -21,6 +22,7 @@ from autocost_jax.store import run_facts
 
 RESULTS = Path(__file__).parent / "results"
 SIZES = (1, 4, 16)
+PARTS = ("mjx", "closed_form", "slots")
 # Env steps a second of one omnisafe 0.5.0 run, nets 64-64, updates included, on two
 # such cores; measured once, apart from this script, which cannot install it.
 OMNISAFE = {"ppo_lagrangian": 90, "cpo": 199}
@@ -56,6 +58,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--preset", choices=PRESETS, default="laptop")
     parser.add_argument("--devices", type=int, default=None)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder")
     options = parser.parse_args()
     devices = use_devices(options.devices)
     config = preset(options.preset)
@@ -67,10 +71,18 @@ def main() -> None:
             print(json.dumps(row._asdict()), flush=True)
         rows.extend(new)
 
-    keep(search_speeds(config, devices))
-    keep(search_speeds(fast, devices))
-    for algorithm in config.algorithms:
+    if "mjx" in options.parts:
+        keep(search_speeds(config, devices))
+    if "closed_form" in options.parts:
+        keep(search_speeds(fast, devices))
+    for algorithm in config.algorithms if "slots" in options.parts else ():
         keep(slot_speeds(fast.train, algorithm, SIZES, devices))
+    # What the whole search takes at these rates, compile and evaluation apart.
+    hours = {
+        row.physics: config.env_steps / row.env_steps_per_second / 3600
+        for row in rows
+        if row.what == "with updates"
+    }
     facts = run_facts()
     facts.pop("seed")
     result = {
@@ -78,9 +90,11 @@ def main() -> None:
         "facts": facts,
         "devices": len(devices),
         "omnisafe": OMNISAFE,
+        "search_hours": {name: round(value, 4) for name, value in hours.items()},
         "rows": [row._asdict() for row in rows],
     }
-    file = RESULTS / f"population_{options.preset}.json"
+    file = options.out / f"population_{options.preset}.json"
+    print(json.dumps({"search_hours": result["search_hours"]}))
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(result, indent=1) + "\n")
     file.with_suffix(".md").write_text(render(result))

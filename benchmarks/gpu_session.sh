@@ -1,0 +1,32 @@
+#!/usr/bin/env bash
+# Everything that waits for a GPU, in under 10 minutes, most important first.
+#
+#     bash benchmarks/gpu_session.sh [OUT]
+#
+# Writes JSON and tables to OUT (default: benchmarks/results/gpu): time of a step against
+# batch in MJX and in closed form, the `search` and `paper` programs with the projection
+# of the paper's whole evolution (search_hours), programs of 1 to 16 slots, and a whole
+# run of the `search` preset. A part that fails does not stop the others.
+set -uo pipefail
+cd "$(dirname "$0")/.."
+out="${1:-benchmarks/results/gpu}"
+mkdir -p "$out"
+export PYTHONPATH="src${PYTHONPATH:+:$PYTHONPATH}"
+
+part() {
+    local name="$1" limit="$2"
+    shift 2
+    echo "== $name"
+    timeout "$limit" "$@" >"$out/$name.log" 2>&1 || echo "   $name ended with $?"
+    tail -n 3 "$out/$name.log"
+}
+
+nvidia-smi >"$out/nvidia-smi.txt" 2>&1
+for batch in 1024 8192 65536; do
+    part "env_steps_$batch" 90 python benchmarks/env_steps.py --batch "$batch" \
+        --only "Goal-Hazard-Point, closed form" Goal-Hazard-Point \
+        --out "$out/env_steps_$batch.json"
+done
+part paper 150 python benchmarks/population.py --preset paper --parts closed_form mjx --out "$out"
+part search 120 python benchmarks/population.py --preset search --out "$out"
+part run 180 python -m autocost_jax.evolve --preset search --physics closed_form --out "$out/run"
