@@ -275,9 +275,11 @@ def test_pillars_beyond_the_nearest_are_never_touched(robot):
 @pytest.mark.parametrize("robot", ["Point", "Car", "Doggo"])
 def test_pillars_beyond_the_nearest_are_never_touched_in_long_runs(robot):
     counts = missed(env_config(f"Push-Pillar-{robot}"), 1, 60, 600)
-    assert (counts[:, 0] > 200).all()
+    assert counts[0, 0] > 200
     assert counts[0, NEAREST[robot]] == 0
-    assert counts[1, NEAREST_TO_BOX] <= 1e-3 * counts[1, 0]
+    if robot != "Doggo":  # whose random gait does not bring the box anywhere
+        assert counts[1, 0] > 200
+        assert counts[1, NEAREST_TO_BOX] <= 1e-3 * counts[1, 0]
 
 
 def control_steps(name: str, physics: str = "reduced") -> tuple[Compiled, Any, Any]:
