@@ -32,25 +32,22 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
-def on_core(index: int):
-    """One core, which is one device, for a process of several."""
-    cores = sorted(os.sched_getaffinity(0))
-    return lambda: os.sched_setaffinity(0, {cores[index % len(cores)]})
-
-
 def start(out: Path, environment, *flags: str, index: int | None = None, port: int = 0):
     words = [sys.executable, "-m", "autocost_jax.evolve", "--out", str(out), *flags]
     if index is not None:
         words += ["--coordinator", f"127.0.0.1:{port}"]
         words += ["--num-processes", "2", "--process-id", str(index)]
-    return subprocess.Popen(
+    process = subprocess.Popen(
         words,
         env=environment,
-        preexec_fn=None if index is None else on_core(index),
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
     )
+    if index is not None:  # one core, which is one device, long before it counts them
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(process.pid, {cores[index % len(cores)]})
+    return process
 
 
 def start_both(out: Path, environment, *flags: str):
