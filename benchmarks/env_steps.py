@@ -10,6 +10,7 @@ benchmarks/results/env_steps.json and the table of it; `--only` renews some rows
 import argparse
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ def main() -> None:
         facts = run_facts()
         facts.pop("seed")
         result = {
-            "command": "python benchmarks/env_steps.py",
+            "command": " ".join(["python benchmarks/env_steps.py", *sys.argv[1:]]),
             "facts": facts,
             "devices": len(devices),
             "peer": "one Safety-Gymnasium 1.0.0 process, resets not counted",

@@ -11,6 +11,7 @@ benchmarks/results/population_PRESET.json and the table of it.
 import argparse
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,7 @@ def main() -> None:
     facts = run_facts()
     facts.pop("seed")
     result = {
-        "command": f"python benchmarks/population.py --preset {options.preset}",
+        "command": " ".join(["python benchmarks/population.py", *sys.argv[1:]]),
         "facts": facts,
         "devices": len(devices),
         "omnisafe": OMNISAFE,

@@ -228,27 +228,34 @@ def _pad(groups: tuple[Any, ...], mesh: Mesh) -> tuple[Any, ...]:
     """Each group filled up with copies of its first slot, laid over the devices."""
     split = NamedSharding(mesh, P(AXIS))
 
-    def fill(leaf: jax.Array) -> jax.Array:
-        missing = -leaf.shape[0] % mesh.size
-        if not missing:
-            return leaf
-        filler = jnp.broadcast_to(leaf[:1], (missing, *leaf.shape[1:]))
-        return jnp.concatenate([leaf, filler])
-
     def pad(leaf: jax.Array) -> jax.Array:
         if split.is_fully_addressable:
-            return jax.device_put(fill(leaf), split)
+            return jax.device_put(_fill(leaf, mesh.size), split)
         if not leaf.is_fully_addressable:  # from an earlier call of the program
-            return jax.jit(fill, out_shardings=split)(leaf)
+            fill = jax.jit(_fill, static_argnums=1, out_shardings=split)
+            return fill(leaf, mesh.size)
         if is_key(leaf):
             data = pad(jax.random.key_data(leaf))
             return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
-        value = np.asarray(fill(leaf))  # the same in every process, which takes its own
+        value = np.asarray(_fill(leaf, mesh.size))  # alike in every process
         return jax.make_array_from_callback(
             value.shape, split, lambda index: value[index]
         )
 
     return tuple(jax.tree.map(pad, group) for group in groups)
+
+
+def _fill(leaf: jax.Array, multiple: int) -> jax.Array:
+    """A leaf [P, ...] with copies of its first row, up to a multiple of rows."""
+    missing = -leaf.shape[0] % multiple
+    if not missing:
+        return leaf
+    filler = jnp.broadcast_to(leaf[:1], (missing, *leaf.shape[1:]))
+    return jnp.concatenate([leaf, filler])
+
+
+def _same(tree: Any) -> Any:
+    return tree
 
 
 def _unpad(groups: tuple[Any, ...], sizes: list[int]) -> tuple[Any, ...]:
@@ -262,11 +269,12 @@ def _unpad(groups: tuple[Any, ...], sizes: list[int]) -> tuple[Any, ...]:
 
 def _fetch(tree: Any, mesh: Mesh) -> Any:
     """A tree as it is, where one process sees all devices; else copied to the host."""
-    if NamedSharding(mesh, P()).is_fully_addressable:
+    everywhere = NamedSharding(mesh, P())
+    if everywhere.is_fully_addressable:
         return tree
     data = jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, tree)
-    everywhere = NamedSharding(mesh, P())
-    data = jax.jit(lambda tree: tree, out_shardings=everywhere)(data)
+    # One function for all calls, so that each shape is compiled once.
+    data = jax.jit(_same, out_shardings=everywhere)(data)
 
     def take(value: jax.Array, like: jax.Array) -> Any:
         host = np.asarray(value)
