@@ -112,6 +112,7 @@ BAD = {
         "policy_minibatches": COUNT,
         "value_passes": COUNT,
         "value_minibatches": COUNT,
+        "critic_precision": ("float16", "", 32),
         "cg_iterations": COUNT,
         "backtrack_steps": COUNT,
         "backtrack_ratio": (0.0, 1.0, -0.5, NAN),

@@ -74,28 +74,6 @@ def assert_same_bits(one, two):
         np.testing.assert_array_equal(a, b)
 
 
-# CPO's ten steps of conjugate gradient in float32 are not converged: a last bit
-# moves its policy by 1e-3. Across programs all else is compared, and in float64 it.
-BEFORE_THE_STEP = (
-    "j_c",
-    "ep_return",
-    "ep_cost",
-    "ep_total_cost",
-    "value_loss",
-    "cost_value_loss",
-    "policy_grad_norm",
-    "cost_grad_norm",
-    "violation",
-)
-
-
-def stable(result):
-    """What one update promises across programs in float32."""
-    (ppo, cpo), (ppo_metrics, cpo_metrics) = result
-    kept = {name: cpo_metrics[name] for name in BEFORE_THE_STEP}
-    return ppo, cpo.agent.critic, ppo_metrics, kept
-
-
 @pytest.fixture(scope="module")
 def reference(program):
     return run(program, groups())
@@ -184,8 +162,8 @@ def wide():
 
 
 def test_another_population_size(program, wide):
-    first = stable(run(program, groups(), epochs=1))
-    again = stable(lanes(wide[1], slice(0, SIZE)))
+    first = run(program, groups(), epochs=1)
+    again = lanes(wide[1], slice(0, SIZE))
     for one, two in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_allclose(one, two, rtol=ONE_UPDATE, atol=ONE_UPDATE)
 
@@ -338,16 +316,14 @@ def test_cohorts_travel_with_their_learners():
     assert len(np.unique(final[0]["ep_return"])) == 3 * SIZE  # fresh ones each round
 
 
-def test_slots_that_learn_in_turns_learn_the_same(program):
-    """Also where the last turn has fewer."""
+@pytest.mark.parametrize("chunk", [3, SIZE])
+def test_slots_that_learn_side_by_side_learn_the_same(program, chunk):
+    """As those that learn in turns, a CPU's default; 3: the last turn has fewer."""
     env = make_toy_env()
-    config = train_config(population_chunk=3)
-    in_turns = make_population(env, make_agents(ALGORITHMS, config, env), config)
-    got, expected = (run(each, groups(), epochs=1) for each in (in_turns, program))
-    pairs = zip(
-        jax.tree.leaves(stable(got)), jax.tree.leaves(stable(expected)), strict=True
-    )
-    for one, all_ in pairs:
+    config = train_config(population_chunk=chunk)
+    together = make_population(env, make_agents(ALGORITHMS, config, env), config)
+    got, expected = (run(each, groups(), epochs=1) for each in (together, program))
+    for one, all_ in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(one, all_, rtol=ONE_UPDATE, atol=ONE_UPDATE)
 
 
@@ -361,7 +337,7 @@ def test_slots_that_learn_in_turns_need_less_memory():
         compiled = population.compile(population.init(slots), slots)
         return compiled.memory_analysis().temp_size_in_bytes
 
-    assert workspace(1) < 0.9 * workspace(0)
+    assert workspace(1) < 0.9 * workspace(MORE)
 
 
 def test_candidates_share_their_random_numbers(key):

@@ -7,7 +7,7 @@ AutoCost paper nor Safety Gym settles.
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from autocost_jax.checks import (
     is_finite,
@@ -21,6 +21,7 @@ from autocost_jax.env_config import EnvConfig
 
 Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
+Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 THETA_SIZE = 41
 
 
@@ -30,7 +31,9 @@ class AgentConfig:
 
     Where the paper is silent they are Safety Gym's starter agents'. An update makes
     `policy_passes` x `policy_minibatches` policy steps (CPO: always one full-batch
-    step) and `value_passes` x `value_minibatches` critic steps.
+    step) and `value_passes` x `value_minibatches` critic steps. `critic_precision` is
+    that of the hidden layers in the critics' own steps, nowhere else: tensorfloat32
+    (of a GPU; float32 elsewhere) or bfloat16 for speed.
     """
 
     hidden_sizes: tuple[int, ...] = (256, 256)
@@ -48,6 +51,7 @@ class AgentConfig:
     value_lr: float = 1e-3
     value_passes: int = 80
     value_minibatches: int = 1
+    critic_precision: Precision = "float32"
     multiplier_init: float = 1.0
     multiplier_lr: float = 0.05
     cg_iterations: int = 10
@@ -66,6 +70,13 @@ class AgentConfig:
             "backtrack_steps",
         )
         require_finite(self, "log_std_init")
+        known = get_args(Precision)
+        require(
+            self.critic_precision in known,
+            "critic_precision",
+            f"one of {', '.join(known)}",
+            self.critic_precision,
+        )
         require(
             all(is_integer(size) and size >= 1 for size in self.hidden_sizes),
             "hidden_sizes",
@@ -102,7 +113,8 @@ class TrainConfig:
     an epoch is `env.num_steps` / k steps long; k = 1 is the paper.
     `chunk_epochs` epochs run in one jitted call. `population_chunk` bounds the memory
     of updates: so many slots of an algorithm learn at once on a device, the others
-    after them; 0 for all at once. The numbers do not depend on it.
+    after them; 0 for what suits the device, one on a CPU and all on others. The
+    numbers do not depend on it.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)

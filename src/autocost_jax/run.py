@@ -43,6 +43,7 @@ from autocost_jax.store import (
     check_free_space,
     estimate_bytes,
 )
+from autocost_jax.train import slots_at_once
 
 
 def estimate_memory(config: SearchConfig, num_devices: int) -> int:
@@ -62,8 +63,7 @@ def estimate_memory(config: SearchConfig, num_devices: int) -> int:
     activations = 4 * batch * width * len(config.train.agent.hidden_sizes)
     per_slot = 2 * row * rows + 4 * 3 * 3 * weights
     here = -(-slots // num_devices)
-    at_once = -(-config.population_size // num_devices)
-    at_once = min(config.train.population_chunk or at_once, at_once)
+    at_once = slots_at_once(config.train, -(-config.population_size // num_devices))
     return 4 * (per_slot * here + activations * at_once)
 
 

@@ -101,7 +101,7 @@ def run_epoch(
         )
         counts = jax.tree.map(lambda x, part=part: x[part], travelled)
         inputs = (learner.replace(worlds=None), slot, group_trajectory, counts)
-        learned, group_metrics = _map_slots(config.population_chunk, update, inputs)
+        learned, group_metrics = _map_slots(config, update, inputs)
         after.append(learned.replace(worlds=learner.worlds))
         metrics.append(group_metrics)
     return tuple(after), tuple(metrics)
@@ -246,9 +246,23 @@ def _carry(
     )
 
 
-def _map_slots(chunk: int, function: Callable[..., Any], inputs: Any) -> Any:
-    """`function` of each slot of inputs [P, ...], `chunk` slots at once; 0 for all."""
-    if not 0 < chunk < jax.tree.leaves(inputs)[0].shape[0]:
+def slots_at_once(config: TrainConfig, num_slots: int) -> int:
+    """How many of a device's slots of one algorithm learn side by side.
+
+    Unless the configuration says: on a CPU one after the other, whose arrays then stay
+    in a core's cache and which stops early by itself; all on other devices.
+    """
+    default = 1 if jax.default_backend() == "cpu" else num_slots
+    return min(config.population_chunk or default, num_slots)
+
+
+def _map_slots(config: TrainConfig, function: Callable[..., Any], inputs: Any) -> Any:
+    """`function` of each slot of inputs [P, ...], `slots_at_once` side by side."""
+    num_slots = jax.tree.leaves(inputs)[0].shape[0]
+    chunk = slots_at_once(config, num_slots)
+    if chunk == 1:  # without the axis of length 1 that `batch_size` would carry along
+        return jax.lax.map(lambda slot: function(*slot), inputs)
+    if chunk == num_slots:
         return jax.vmap(function)(*inputs)
     return jax.lax.map(lambda slot: function(*slot), inputs, batch_size=chunk)
 

@@ -91,3 +91,38 @@ def test_sampled_actions_have_the_policy_s_moments():
     # 5 sigmas of 40 000 samples
     np.testing.assert_allclose(action.mean(0), [1.0, -2.0], atol=0.025)
     np.testing.assert_allclose(action.std(0), np.exp([0.0, -1.0]), rtol=0.02)
+
+
+@pytest.mark.parametrize("precision", ["tensorfloat32", "bfloat16"])
+def test_critics_of_a_lower_precision_stay_close(precision):
+    config = AgentConfig(hidden_sizes=(64, 64), critic_precision=precision)
+    networks = make_networks(config, 36, 2)
+    _, critic = networks.init(jax.random.key(0))
+    obs = jax.random.normal(jax.random.key(1), (100, 36))
+    exact, rough = networks.values(critic, obs), networks.values(critic, obs, precision)
+    assert rough.dtype == exact.dtype
+    np.testing.assert_allclose(rough, exact, atol=0.05)  # 8 bits of mantissa
+    if precision == "bfloat16":
+        assert np.abs(rough - exact).max() > 1e-4  # it is another precision
+
+
+@pytest.mark.parametrize(
+    ("precision", "expect"),
+    [("float32", "HIGHEST"), ("tensorfloat32", "HIGH"), ("bfloat16", "bf16")],
+)
+def test_the_critics_own_steps_use_the_precision(precision, expect):
+    """Forward and backward products of the hidden layers, by what is compiled."""
+    config = AgentConfig(hidden_sizes=(8,), critic_precision=precision)
+    networks = make_networks(config, 5, 2)
+    _, critic = networks.init(jax.random.key(0))
+
+    def loss(critic, obs):
+        with jax.default_matmul_precision("highest"):
+            return networks.values(critic, obs, precision).sum()
+
+    obs = jnp.ones((7, 5))
+    text = jax.jit(jax.grad(loss)).lower(critic, obs).as_text()
+    products = [line for line in text.splitlines() if "dot_general" in line]
+    wide = [line for line in products if "5" in line]  # those that see observations
+    assert wide
+    assert all(expect in line for line in wide)

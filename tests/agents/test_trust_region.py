@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
+from autocost_jax.agents import blocks as row_blocks
 from autocost_jax.agents import fisher
 from autocost_jax.agents.advantages import weighted_mean
 from autocost_jax.agents.networks import kl_divergence, make_networks
@@ -55,6 +56,28 @@ def test_conjugate_gradient_against_solve():
             x = conjugate_gradient(times(H), jnp.array(rhs), n + 4)
         # 1e-20 is the squared residual at which the recurrence rests
         np.testing.assert_allclose(x, np.linalg.solve(H, rhs.T).T, atol=1e-8)
+
+
+def test_conjugate_gradient_does_not_amplify_rounding():
+    """A spectrum like a Fisher matrix's: a dozen directions above the damping.
+
+    In float32 the bare recurrence is up to 0.08 of the solution away from its own
+    float64 result after ten iterations.
+    """
+    rng = np.random.default_rng(0)
+    n = 400
+    rotation, _ = np.linalg.qr(rng.normal(size=(n, n)))
+    spectrum = np.concatenate([np.geomspace(1.0, 1e3, 12), np.full(n - 12, 0.1)])
+    H = ((rotation * spectrum) @ rotation.T).astype(np.float32)
+    rhs = rng.normal(size=(8, n)).astype(np.float32)
+    rhs /= np.linalg.norm(rhs, axis=1, keepdims=True)
+    single = conjugate_gradient(times(H), jnp.array(rhs), 10)
+    with jax.enable_x64(True):
+        H64, rhs64 = H.astype(np.float64), rhs.astype(np.float64)
+        double = conjugate_gradient(times(H64), jnp.array(rhs64), 10)
+    assert double.dtype == np.float64
+    size = np.abs(double).max(axis=1)
+    assert np.all(np.abs(single - double).max(axis=1) < 3e-5 * size)
 
 
 @pytest.mark.parametrize("H", [np.zeros((3, 3)), -np.eye(3), H3])
@@ -133,7 +156,7 @@ def test_factored_fisher_product_equals_the_generic_one(
 
 def test_row_blocks_divide_the_rows():
     for rows in (1, 7, 160, 8000, 30_000, 30_001):
-        assert rows % fisher.num_row_blocks(rows) == 0
+        assert rows % row_blocks.num_row_blocks(rows) == 0
 
 
 def test_backtrack_takes_the_first_acceptable_candidate():

@@ -1,7 +1,7 @@
 """What all agents share: the bundle of functions, the batch, the critics' update.
 
-An update reduces over one agent's batch only, weights every row by its validity
-and has fixed trip counts, so that it can be vmapped over slots.
+An update reduces over one agent's batch only and weights every row by its validity,
+so that it can be vmapped over slots.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,7 @@ import optax
 from flax import struct
 
 from autocost_jax.agents.advantages import centre, gae, normalise, weighted_mean
+from autocost_jax.agents.blocks import mean_over_blocks
 from autocost_jax.agents.networks import (
     COST,
     REWARD,
@@ -250,13 +251,14 @@ def update_critics(
     def loss_fn(params: Params, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         obs, rest = rows
         target, weight = rest[:, :2].T, rest[:, 2]
-        error = (networks.values(params, obs) - target) ** 2
-        total = jnp.sum(error * weight[None])
-        return total / jnp.maximum(jnp.sum(weight), 1.0)
+        value = networks.values(params, obs, config.critic_precision)
+        return weighted_mean(jnp.sum((value - target) ** 2, axis=0), weight)
 
     def step(carry: tuple[Params, Any], rows: Any) -> tuple[tuple[Params, Any], Any]:
         params, opt_state = carry
-        grads = jax.grad(loss_fn)(params, rows)
+        grads = mean_over_blocks(
+            lambda rows: jax.grad(loss_fn)(params, rows), rows, rows[1][:, -1]
+        )
         updates, opt_state = optimizer.update(grads, opt_state)
         params = optax.apply_updates(params, updates)
         return (params, opt_state), global_norm(grads)

@@ -11,32 +11,23 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from autocost_jax.agents.blocks import num_row_blocks
 from autocost_jax.agents.networks import Params
 from autocost_jax.agents.trust_region import Product
-
-_CPU_BLOCK = 1000  # rows whose intermediate arrays stay in a core's cache
-
-
-def num_row_blocks(num_rows: int) -> int:
-    """Blocks in which a CPU walks through the rows, a divisor; 1 on accelerators."""
-    if jax.default_backend() != "cpu":
-        return 1
-    most = max(1, num_rows // _CPU_BLOCK)
-    return next(count for count in range(most, 0, -1) if num_rows % count == 0)
 
 
 def _jacobian_factors(
     layers: list[dict[str, jax.Array]], obs: jax.Array
 ) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Inputs [R, I] of every layer and d mean / d (pre-activation) [R, U, H]."""
+    """Inputs [R, I] of every layer and d mean / d (pre-activation) [U, R, H]."""
     inputs = [obs]
     for layer in layers[:-1]:
         bias = layer["bias"][None]
         inputs.append(jnp.tanh(inputs[-1] @ layer["kernel"] + bias))
     derivatives = []
-    signal = layers[-1]["kernel"].T[None]
+    signal = layers[-1]["kernel"].T[:, None]
     for layer, output in zip(layers[-2::-1], inputs[:0:-1], strict=True):
-        derivatives.insert(0, (1 - output**2)[:, None] * signal)
+        derivatives.insert(0, (1 - output**2)[None] * signal)
         signal = derivatives[0] @ layer["kernel"].T
     return inputs, derivatives
 
@@ -59,7 +50,7 @@ def mlp_fisher_product(
       damping: added to every eigenvalue.
 
     Returns:
-      A function of a stack of directions [K, n] -> [K, n], in the order of
+      A function of a few directions [K, n] -> [K, n], in the order of
       `ravel_pytree(params)`; equal to `trust_region.fisher_product` to rounding.
     """
     names = [f"Dense_{index}" for index in range(len(params["mean"]))]
@@ -67,60 +58,58 @@ def mlp_fisher_product(
     layers = [params["mean"][name] for name in names]
     num_blocks = num_row_blocks(obs.shape[0])
 
-    def block(x: jax.Array) -> jax.Array:
+    def split(x: jax.Array) -> jax.Array:
         return x.reshape(num_blocks, -1, *x.shape[1:])
 
-    inputs, derivatives = jax.tree.map(block, _jacobian_factors(layers, obs))
+    factors = jax.lax.map(lambda obs: _jacobian_factors(layers, obs), split(obs))
+    inputs, derivatives = factors
     # Formed once: left to itself XLA would transpose the other factor every time.
     transposed = jax.lax.optimization_barrier([x.swapaxes(1, 2) for x in inputs])
     share = weight / jnp.maximum(jnp.sum(weight), 1.0)
-    scale = share[:, None] * jnp.exp(-2.0 * params["log_std"])[None]
-    rows = (inputs, transposed, derivatives, block(scale))
+    scale = split(share[:, None] * jnp.exp(-2.0 * params["log_std"])[None])
+    rows = (inputs, transposed, derivatives, scale)
+    zero = [{name: jnp.zeros_like(leaf) for name, leaf in x.items()} for x in layers]
+
+    def of_block(layers: Any, rows: Any) -> Any:
+        """What one block of rows adds to the image of one direction."""
+        inputs, transposed, derivatives, scale = rows
+        pushed = [
+            x @ layer["kernel"] + layer["bias"]
+            for x, layer in zip(inputs, layers, strict=True)
+        ]
+        # Everything over the few outputs is written out: it fuses, a reduction over
+        # them or a product with an axis of them does not.
+        mean = []
+        for i in range(scale.shape[-1]):
+            pairs = zip(pushed, derivatives, strict=False)
+            hidden = [jnp.sum(y * d[i], axis=-1) for y, d in pairs]
+            mean.append(scale[:, i] * sum(hidden, pushed[-1][:, i]))
+        pulled: list[Any] = [
+            sum(m[:, None] * d[i] for i, m in enumerate(mean)) for d in derivatives
+        ]
+        pulled.append(jnp.stack(mean, axis=-1))
+        return [
+            {"kernel": x @ p, "bias": jnp.sum(p, axis=0)}
+            for x, p in zip(transposed, pulled, strict=True)
+        ]
 
     def product(direction: jax.Array) -> jax.Array:
-        count = direction.shape[0]
-        parts: Any = jax.vmap(unravel)(direction)
-        # All K directions side by side: [I, K * H] and [K * H].
-        kernels = [
-            parts["mean"][name]["kernel"].swapaxes(0, 1).reshape(x.shape[-1], -1)
-            for name, x in zip(names, inputs, strict=True)
-        ]
-        biases = [parts["mean"][name]["bias"].reshape(-1) for name in names]
+        parts = [unravel(z) for z in direction]
+        stacks = [[part["mean"][name] for name in names] for part in parts]
 
-        def add_block(total: Any, rows: Any) -> tuple[Any, None]:
-            inputs, transposed, derivatives, scale = rows
-            pushed = [
-                (x @ kernel + bias[None]).reshape(x.shape[0], count, -1)
-                for x, kernel, bias in zip(inputs, kernels, biases, strict=True)
-            ]
-            hidden = [
-                jnp.sum(y[:, :, None] * d[:, None], axis=-1)
-                for y, d in zip(pushed, derivatives, strict=False)
-            ]
-            mean = scale[:, None] * sum(hidden, pushed[-1])  # [r, K, U]
-            # Sums over the few outputs written out: they fuse, a reduction does not.
-            pulled: list[Any] = [
-                sum(mean[:, :, i, None] * d[:, None, i] for i in range(d.shape[1]))
-                for d in derivatives
-            ]
-            pulled = [p.reshape(p.shape[0], -1) for p in (*pulled, mean)]
-            new = [
-                (x @ p, jnp.sum(p, axis=0))
-                for x, p in zip(transposed, pulled, strict=True)
-            ]
-            return jax.tree.map(jnp.add, total, new), None
+        def add_block(totals: Any, rows: Any) -> tuple[Any, None]:
+            new = [of_block(layers, rows) for layers in stacks]
+            return jax.tree.map(jnp.add, totals, new), None
 
-        zero = jax.tree.map(jnp.zeros_like, list(zip(kernels, biases, strict=True)))
-        total, _ = jax.lax.scan(add_block, zero, rows)
-        mean = {
-            name: {
-                "kernel": kernel.reshape(kernel.shape[0], count, -1).swapaxes(0, 1),
-                "bias": bias.reshape(count, -1),
+        totals, _ = jax.lax.scan(add_block, [zero] * len(stacks), rows)
+        images = [
+            {
+                "mean": dict(zip(names, total, strict=True)),
+                "log_std": 2.0 * part["log_std"],
             }
-            for name, (kernel, bias) in zip(names, total, strict=True)
-        }
-        image = {"mean": mean, "log_std": 2.0 * parts["log_std"]}
-        flat = jax.vmap(lambda tree: ravel_pytree(tree)[0])(image)
+            for part, total in zip(parts, totals, strict=True)
+        ]
+        flat = jnp.stack([ravel_pytree(image)[0] for image in images])
         return flat + damping * direction
 
     return product

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from autocost_jax.config import AgentConfig
+from autocost_jax.config import AgentConfig, Precision
 from autocost_jax.records import Key
 
 Params = Any
@@ -27,33 +27,43 @@ class Networks(NamedTuple):
     Attributes:
       init: key -> (policy parameters, critic parameters stacked on an axis of 2).
       distribution: (policy parameters, obs [..., O]) -> (mean [..., U], log_std [U]).
-      values: (critic parameters, obs [..., O]) -> [2, ...], reward and cost value.
+      values: (critic parameters, obs [..., O], precision="float32") -> [2, ...],
+        reward and cost value; see `AgentConfig.critic_precision`.
     """
 
     init: Callable[[Key], tuple[Params, Params]]
     distribution: Callable[[Params, jax.Array], tuple[jax.Array, jax.Array]]
-    values: Callable[[Params, jax.Array], jax.Array]
+    values: Callable[..., jax.Array]
 
 
 class Mlp(nn.Module):
-    """tanh layers of `hidden_sizes`, then a linear layer of `output_size`."""
+    """tanh layers of `hidden_sizes`, then a linear layer of `output_size`.
+
+    The hidden layers compute in `hidden_dtype`, the output in that of the parameters.
+    """
 
     hidden_sizes: tuple[int, ...]
     output_size: int
     param_dtype: Any
+    hidden_dtype: Any = None
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Outputs [..., output_size] for inputs x [..., I]."""
-        for index, size in enumerate((*self.hidden_sizes, self.output_size)):
-            if index > 0:
-                x = nn.tanh(x)
-            x = nn.Dense(
+
+        def dense(size: int, dtype: Any) -> nn.Dense:
+            return nn.Dense(
                 size,
                 kernel_init=nn.initializers.glorot_uniform(),
                 param_dtype=self.param_dtype,
-            )(x)
-        return x
+                dtype=dtype,
+            )
+
+        for size in self.hidden_sizes:
+            x = nn.tanh(dense(size, self.hidden_dtype)(x))
+        if self.hidden_dtype is not None:
+            x = x.astype(self.param_dtype)
+        return dense(self.output_size, None)(x)
 
 
 class GaussianPolicy(nn.Module):
@@ -95,6 +105,7 @@ def make_networks(
         config.hidden_sizes, action_size, config.log_std_init, dtype
     )
     critic = Mlp(config.hidden_sizes, 1, dtype)
+    critic_bfloat16 = critic.clone(hidden_dtype=jnp.bfloat16)
     dummy = jnp.zeros((1, observation_size), dtype)
 
     def init(key: Key) -> tuple[Params, Params]:
@@ -109,11 +120,18 @@ def make_networks(
         output: Any = policy.apply({"params": params}, obs)
         return output
 
-    def values(params: Params, obs: jax.Array) -> jax.Array:
+    def values(
+        params: Params, obs: jax.Array, precision: Precision = "float32"
+    ) -> jax.Array:
+        network = critic_bfloat16 if precision == "bfloat16" else critic
+
         def value(one: Params) -> jax.Array:
-            output: Any = critic.apply({"params": one}, obs)
+            output: Any = network.apply({"params": one}, obs)
             return jnp.squeeze(output, -1)
 
+        if precision == "tensorfloat32":
+            with jax.default_matmul_precision("tensorfloat32"):
+                return jax.vmap(value)(params)
         return jax.vmap(value)(params)
 
     return Networks(init, distribution, values)

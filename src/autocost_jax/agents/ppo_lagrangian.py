@@ -4,6 +4,7 @@ Source: openai/safety-starter-agents, with the multiplier held constant inside t
 policy loss and the KL stop tested before a pass instead of after it.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -25,6 +26,7 @@ from autocost_jax.agents.base import (
     split_rows,
     update_critics,
 )
+from autocost_jax.agents.blocks import mean_over_blocks
 from autocost_jax.agents.networks import (
     Networks,
     Params,
@@ -138,55 +140,84 @@ def update_policy(
         loss = policy_loss(new, rest[:, action_size:], multiplier, config.clip_eps)
         return loss, (mean, log_std)
 
-    def kl_of(distribution: tuple[jax.Array, jax.Array]) -> jax.Array:
-        kl = kl_divergence(*distribution, batch.mean_old, batch.log_std_old)
-        return weighted_mean(kl, batch.weight)
+    def kl_of(
+        distribution: tuple[jax.Array, jax.Array],
+        mean_old: jax.Array,
+        weight: jax.Array,
+    ) -> jax.Array:
+        kl = kl_divergence(*distribution, mean_old, batch.log_std_old)
+        return weighted_mean(kl, weight)
 
-    def step(carry: Any, rows: Any) -> tuple[Any, Any]:
+    def whole(function: Callable[[Any, jax.Array], Any]) -> Any:
+        """Means over the whole batch, of a function of (rows, mean_old)."""
+        return mean_over_blocks(
+            lambda block: function(*block), (rows, batch.mean_old), batch.weight
+        )
+
+    def apply(carry: Any, grads: Any) -> Any:
         params, opt_state = carry
-        grads, distribution = jax.grad(loss_fn, has_aux=True)(params, rows)
         updates, opt_state = optimizer.update(grads, opt_state)
-        new = (optax.apply_updates(params, updates), opt_state)
-        return new, (global_norm(grads), distribution)
+        return optax.apply_updates(params, updates), opt_state
 
-    def one_pass(carry: Any, key: Key) -> tuple[Any, Any]:
-        old, stopped = carry
+    def minibatch_step(carry: Any, rows: Any) -> tuple[Any, jax.Array]:
+        grads = mean_over_blocks(
+            lambda rows: jax.grad(loss_fn, has_aux=True)(carry[0], rows)[0],
+            rows,
+            rows[1][:, -1],
+        )
+        return apply(carry, grads), global_norm(grads)
+
+    def one_pass(carry: tuple[Any, jax.Array, jax.Array, jax.Array]) -> Any:
+        old, taken, _, first_norm = carry
+
+        def kl_and_grads(rows: Any, mean_old: jax.Array) -> Any:
+            grads, distribution = jax.grad(loss_fn, has_aux=True)(old[0], rows)
+            return kl_of(distribution, mean_old, rows[1][:, -1]), grads
+
+        def kl_alone(rows: Any, mean_old: jax.Array) -> jax.Array:
+            distribution = networks.distribution(old[0], rows[0])
+            return kl_of(distribution, mean_old, rows[1][:, -1])
+
         if config.policy_minibatches == 1:
             # The gradient's own forward pass is the whole batch at `old`.
-            new, (norm, distribution) = step(old, rows)
+            kl, grads = whole(kl_and_grads)
+            new, norm = apply(old, grads), global_norm(grads)
         else:
-            distribution = networks.distribution(old[0], batch.obs)
-            split = split_rows(key, rows, config.policy_minibatches)
-            new, norms = jax.lax.scan(
-                lambda carry, rows: _first(step(carry, rows)), old, split
-            )
+            kl = whole(kl_alone)
+            split = split_rows(keys[taken], rows, config.policy_minibatches)
+            new, norms = jax.lax.scan(minibatch_step, old, split)
             norm = norms[0]
-        # Written so that a NaN stops as well.
-        stopped = stopped | ~(kl_of(distribution) <= kl_stop)
+        stopped = ~(kl <= kl_stop)  # so written that a NaN stops as well
         kept = jax.tree.map(lambda a, b: jnp.where(stopped, a, b), old, new)
-        return (kept, stopped), (stopped, norm)
+        first_norm = jnp.where(taken == 0, norm, first_norm)
+        return kept, taken + ~stopped, stopped, first_norm
+
+    def is_running(carry: tuple[Any, jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        _, taken, stopped, _ = carry
+        return ~stopped & (taken < config.policy_passes)
+
+    def at_end(rows: Any, mean_old: jax.Array) -> tuple[jax.Array, jax.Array]:
+        loss, distribution = loss_fn(params, rows)
+        return loss, kl_of(distribution, mean_old, rows[1][:, -1])
 
     keys = jax.random.split(key, config.policy_passes)
-    start = ((params, opt_state), jnp.zeros((), bool))
-    ((params, opt_state), _), (stopped, norms) = jax.lax.scan(one_pass, start, keys)
-    loss, distribution = loss_fn(params, rows)
+    zero = jnp.zeros((), batch.obs.dtype)
+    start = ((params, opt_state), jnp.zeros((), jnp.int32), jnp.zeros((), bool), zero)
+    # Ends when all slots of a `vmap` have stopped.
+    end = jax.lax.while_loop(is_running, one_pass, start)
+    (params, opt_state), taken, _, first_norm = end
+    loss, kl = whole(at_end)
     return (
         params,
         opt_state,
         {
-            "kl": kl_of(distribution),
+            "kl": kl,
             "policy_loss": loss,
-            "entropy": entropy(distribution[1]),
-            "policy_steps": jnp.sum(~stopped) * config.policy_minibatches,
-            "policy_grad_norm": norms[0],
+            "entropy": entropy(params["log_std"]),
+            "policy_steps": taken * config.policy_minibatches,
+            "policy_grad_norm": first_norm,
         },
     )
-
-
-def _first(result: tuple[Any, Any]) -> tuple[Any, jax.Array]:
-    """A step's carry and gradient norm, without its outputs."""
-    carry, (norm, _) = result
-    return carry, norm
 
 
 def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
