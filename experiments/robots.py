@@ -13,7 +13,6 @@ written to experiments/results/robots/.
 import argparse
 import dataclasses
 import json
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,12 +20,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from common import compact, run_if_needed, t_interval
 from robots_tables import ALGORITHMS, draw, render
 
 from autocost_jax import Agent, EnvConfig, TrainConfig, env_config, make_env, preset
 from autocost_jax.arrays import write_atomic
 from autocost_jax.commandline import use_devices
-from autocost_jax.methods import Learners, Method, TableConfig, run_table, table_slots
+from autocost_jax.methods import Learners, Method, TableConfig, table_slots
 from autocost_jax.policies import EVALUATION, eval_summary
 from autocost_jax.population import make_agents, make_evaluator
 from autocost_jax.rundata import to_json
@@ -160,15 +160,6 @@ def sized(env: EnvConfig, worlds: int, epochs: int, options: Options) -> TrainCo
     )
 
 
-def run_if_needed(config: TableConfig, path: Path, num_episodes: int) -> None:
-    """Train a table unless that is done; continue where it was stopped."""
-    if (path / "evaluation.json").exists():
-        return
-    resume = (path / "config.yaml").exists()
-    devices = jax.devices()
-    run_table(config, path, resume=resume, devices=devices, num_episodes=num_episodes)
-
-
 def evaluate_random(config: TableConfig, num_episodes: int) -> list[dict[str, Any]]:
     """Scores of the untrained networks and of uniform actions, one row a seed.
 
@@ -202,19 +193,6 @@ def evaluate_random(config: TableConfig, num_episodes: int) -> list[dict[str, An
         | eval_summary(jax.tree.map(lambda leaf, i=i: leaf[i], results))
         for i, (name, seed) in enumerate(kinds)
     ]
-
-
-def t_interval(values: Sequence[float] | np.ndarray) -> dict[str, Any]:
-    """Mean of one value a seed with its 95 % t-interval; NaN for a single seed."""
-    from scipy.stats import t
-
-    values = np.asarray(values, np.float64)
-    count = values.size
-    if count < 2:
-        return {"mean": float(values.mean()), "low": np.nan, "high": np.nan}
-    half = t.ppf(0.975, count - 1) * values.std(ddof=1) / np.sqrt(count)
-    mean = float(values.mean())
-    return {"mean": mean, "low": float(mean - half), "high": float(mean + half)}
 
 
 def collect_run(path: Path) -> dict[str, Any]:
@@ -348,14 +326,6 @@ def collect(options: Options) -> None:
     file.with_suffix(".md").write_text(render(result))
     draw(result, options.results)
     print(file)
-
-
-def compact(value: Any) -> str:
-    """JSON with one line for each innermost list."""
-    text = json.dumps(value, indent=1, allow_nan=False)
-    return re.sub(
-        r"\[[^\[\]{}]*\]", lambda match: " ".join(match.group().split()), text
-    )
 
 
 PARTS: dict[str, Callable[[Options], None]] = {

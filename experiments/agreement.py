@@ -1,0 +1,235 @@
+"""Do the fast variants learn what the plain one learns?
+
+    python experiments/agreement.py run       # train every variant, the same seeds
+    python experiments/agreement.py collect   # JSON, table, figure of what has run
+
+The plain variant is the closed-form Point with one segment an episode and float32
+critics. The others change one thing: the physics engine, the cohorts, the critics'
+precision. `--only NAME ...` takes some variants, `--smoke` shrinks everything to a
+minute. Results are written to experiments/results/agreement/ (reduced scale).
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from common import compact, run_if_needed, t_interval
+
+from autocost_jax import TrainConfig, env_config, preset
+from autocost_jax.commandline import use_devices
+from autocost_jax.methods import Method, TableConfig
+from autocost_jax.rundata import to_json
+from autocost_jax.store import read_config, read_metrics, run_facts
+
+PLAIN = "plain"
+# What differs from the plain variant: of the world, of the training, of the agent.
+VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
+    PLAIN: ({}, {}, {}),
+    "MJX": ({"physics": "reduced"}, {}, {}),
+    "5 cohorts": ({}, {"segments_per_episode": 5}, {}),
+    "bfloat16 critics": ({}, {}, {"critic_precision": "bfloat16"}),
+}
+ALGORITHMS = ("ppo_lagrangian", "cpo")
+EPOCHS, SEEDS, EPISODES = 100, tuple(range(10)), 50
+SCORES = ("return_mean", "cost_mean")
+
+
+class Options(NamedTuple):
+    """Where things go, and how much of them.
+
+    Attributes:
+      runs: directory of the run directories.
+      results: directory of the JSON, table and figure.
+      only: variants.
+      smoke: the smallest size at which every line of code runs.
+    """
+
+    runs: Path
+    results: Path
+    only: tuple[str, ...]
+    smoke: bool
+
+
+def run(options: Options) -> None:
+    """Train both algorithms with limit 0 in every variant."""
+    methods = tuple(Method(name, name) for name in ALGORITHMS)
+    for name in options.only:
+        train = variant(name, options.smoke)
+        seeds = SEEDS[:2] if options.smoke else SEEDS
+        config = TableConfig(train, methods, seeds)
+        episodes = 2 if options.smoke else EPISODES
+        run_if_needed(config, folder(options, name), episodes)
+
+
+def folder(options: Options, name: str) -> Path:
+    """The run directory of a variant."""
+    return options.runs / name.replace(" ", "_")
+
+
+def variant(name: str, smoke: bool) -> TrainConfig:
+    """The `laptop` update, 8000 steps an epoch, with what the variant changes."""
+    env_changes, train_changes, agent_changes = VARIANTS[name]
+    train = preset("smoke" if smoke else "laptop").train
+    env = dataclasses.replace(env_config("Goal-Hazard-Point"), physics="closed_form")
+    if smoke:
+        env = dataclasses.replace(env, num_steps=50)
+    return dataclasses.replace(
+        train,
+        env=dataclasses.replace(env, **env_changes),
+        agent=dataclasses.replace(train.agent, **agent_changes),
+        num_epochs=4 if smoke else EPOCHS,
+        **train_changes,
+    )
+
+
+def collect(options: Options) -> None:
+    """Write the JSON, the table and the figure of whatever has been run."""
+    options.results.mkdir(parents=True, exist_ok=True)
+    done = [
+        name
+        for name in VARIANTS
+        if (folder(options, name) / "evaluation.json").exists()
+    ]
+    result = {
+        "command": "python experiments/agreement.py run",
+        "facts": run_facts(),
+        "update": "laptop preset: nets 64-64, 6 passes x 8 minibatches (reduced scale)",
+        "variants": {name: collect_variant(folder(options, name)) for name in done},
+    }
+    result["differences"] = {
+        name: {
+            algorithm: {
+                score: difference(
+                    result["variants"][name]["scores"][algorithm][score],
+                    result["variants"][PLAIN]["scores"][algorithm][score],
+                )
+                for score in SCORES
+            }
+            for algorithm in ALGORITHMS
+        }
+        for name in done
+        if name != PLAIN
+    }
+    file = options.results / "agreement.json"
+    file.write_text(compact(to_json(result)) + "\n")
+    result = json.loads(file.read_text())
+    file.with_suffix(".md").write_text(render(result))
+    draw(result, options.results / "agreement.png")
+    print(file)
+
+
+def collect_variant(path: Path) -> dict[str, Any]:
+    """Scores of fresh episodes, one a seed, and the curves of each algorithm."""
+    config = read_config(path, TableConfig)[0]
+    evaluated = json.loads((path / "evaluation.json").read_text())
+    rows = read_metrics(path)
+    scores = {
+        algorithm: {
+            score: [
+                row[score] for row in evaluated["rows"] if row["method"] == algorithm
+            ]
+            for score in SCORES
+        }
+        for algorithm in ALGORITHMS
+    }
+    curves: dict[str, Any] = {}
+    for group in config.algorithms:
+        names = [method.label for method, _ in config.group(group)]
+        for algorithm in set(names):
+            own = [i for i, name in enumerate(names) if name == algorithm]
+            curves[algorithm] = {
+                key: [
+                    round(float(np.mean(np.take(row[f"{group}/{key}"], own))), 3)
+                    for row in rows
+                ]
+                for key in ("ep_return", "ep_cost")
+            }
+    train = config.train
+    return {
+        "steps_a_slot": train.num_worlds * train.env.num_steps * len(rows),
+        "seeds": list(config.seeds),
+        "episodes": evaluated["episodes"],
+        "scores": scores,
+        "curves": curves,
+    }
+
+
+def difference(values: list[float], plain: list[float]) -> dict[str, Any]:
+    """Mean difference with a 95 % t-interval over seeds.
+
+    A seed's two runs share their networks' start and their layouts, so the difference
+    is taken seed by seed.
+    """
+    return t_interval(np.subtract(values, plain))
+
+
+def render(result: dict[str, Any]) -> str:
+    """One line for each variant: scores, and what differs from the plain variant."""
+    lines = [
+        "| variant | PPO-Lagrangian return, cost | differs by (95 %) "
+        "| CPO return, cost | differs by (95 %) |",
+        "|---|---|---|---|---|",
+    ]
+    for name, row in result["variants"].items():
+        cells = [name]
+        for algorithm in ALGORITHMS:
+            means = [np.mean(row["scores"][algorithm][score]) for score in SCORES]
+            cells.append(", ".join(f"{mean:.2f}" for mean in means))
+            gaps = result["differences"].get(name, {}).get(algorithm, {})
+            cells.append(
+                ", ".join(
+                    f"{gap['mean']:.2f} ({gap['low']:.2f} to {gap['high']:.2f})"
+                    for gap in gaps.values()
+                )
+            )
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def draw(result: dict[str, Any], file: Path) -> None:
+    """Mean curves over the seeds, a line a variant."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, len(ALGORITHMS), figsize=(9, 6), sharex=True)
+    for column, algorithm in enumerate(ALGORITHMS):
+        for row, key in enumerate(("ep_return", "ep_cost")):
+            panel = axes[row, column]
+            for name, run in result["variants"].items():
+                panel.plot(run["curves"][algorithm][key], label=name, linewidth=1)
+            panel.set_ylabel(key)
+        axes[0, column].set_title(algorithm.replace("_", "-"))
+        axes[1, column].set_xlabel("epoch of 8000 steps (reduced scale)")
+    axes[0, 0].legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(file, dpi=120)
+    plt.close(figure)
+
+
+PARTS: dict[str, Callable[[Options], None]] = {"run": run, "collect": collect}
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=PARTS)
+    parser.add_argument("--only", nargs="+", choices=VARIANTS, default=tuple(VARIANTS))
+    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--runs", type=Path, help="default: runs/agreement")
+    parser.add_argument("--results", type=Path)
+    args = parser.parse_args()
+    runs = args.runs or Path("runs/agreement_smoke" if args.smoke else "runs/agreement")
+    where = runs / "results" if args.smoke else Path("experiments/results/agreement")
+    options = Options(runs, args.results or where, tuple(args.only), args.smoke)
+    use_devices(None)  # a device a core, before anything of JAX runs
+    PARTS[args.part](options)
+
+
+if __name__ == "__main__":
+    main()
