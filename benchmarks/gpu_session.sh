@@ -28,5 +28,7 @@ for batch in 1024 8192 65536; do
         --out "$out/env_steps_$batch.json"
 done
 part paper 150 python benchmarks/population.py --preset paper --parts closed_form mjx --out "$out"
-part search 120 python benchmarks/population.py --preset search --out "$out"
+part update 120 python benchmarks/population.py --preset paper --parts update --update-slots 50 \
+    --precisions float32 tensorfloat32 bfloat16 --out "$out"
+part search 120 python benchmarks/population.py --preset search --parts closed_form slots --out "$out"
 part run 180 python -m autocost_jax.evolve --preset search --physics closed_form --out "$out/run"

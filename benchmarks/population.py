@@ -1,49 +1,79 @@
 """How fast a preset's program compiles and runs; one program against many.
 
     python benchmarks/population.py --preset laptop
-    python benchmarks/population.py --preset paper --parts mjx closed_form
+    python benchmarks/population.py --preset paper --parts mjx closed_form update
+    python benchmarks/population.py --preset laptop --parts devices --devices 8
 
-See `autocost_jax.bench`: the search's program with and without updates, and one
-algorithm's programs of 1 to 16 slots, on at most one device a slot. Writes
-benchmarks/results/population_PRESET.json and the table of it.
+See `autocost_jax.bench`: the search's program and what it is made of (mjx,
+closed_form); one algorithm's programs of 1 to 16 slots, on at most one device a slot
+(slots); 16 slots on 1, 2, 4 ... devices (devices); a compile without and with a cache
+(compile); updates against the devices' own matrix products (update). Writes
+benchmarks/results/population_PRESET.json and the table of it; parts that are not asked
+for stay as they were.
 """
 
 import argparse
 import dataclasses
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from autocost_jax import PRESETS, preset
-from autocost_jax.bench import Speed, search_speeds, slot_speeds
+from autocost_jax.bench import (
+    compile_times,
+    device_speeds,
+    search_speeds,
+    slot_speeds,
+    update_speed,
+)
 from autocost_jax.commandline import use_devices
-from autocost_jax.config import SearchConfig
+from autocost_jax.config import Precision, SearchConfig, TrainConfig
 from autocost_jax.store import run_facts
 
 RESULTS = Path(__file__).parent / "results"
 SIZES = (1, 4, 16)
-PARTS = ("mjx", "closed_form", "slots")
-# Env steps a second of one omnisafe 0.5.0 run, nets 64-64, updates included, on two
-# such cores; measured once, apart from this script, which cannot install it.
-OMNISAFE = {"ppo_lagrangian": 90, "cpo": 199}
+PARTS = ("mjx", "closed_form", "slots", "devices", "compile", "update")
 
 
 def render(result: dict[str, Any]) -> str:
-    """The table of the README."""
+    """The tables of the README, a part each."""
+    parts = result["parts"]
+    rows = [row for part in PARTS[:4] for row in parts.get(part, {}).get("rows", ())]
     lines = [
-        "| program | worlds | cold compile | env steps/s | one omnisafe run |",
-        "|---|---|---|---|---|",
+        "| program | worlds | cold compile | env steps/s |",
+        "|---|---|---|---|",
     ]
-    for row in result["rows"]:
-        rate = result["omnisafe"].get(row["what"].partition(",")[0])
-        ratio = f"{row['env_steps_per_second'] / rate:,.0f} x" if rate else ""
+    for row in rows:
+        name = row["what"].replace(", 1 slots", ", 1 slot").replace("_", "-")
+        name = name.replace(", 1 devices", ", 1 device")
         lines.append(
-            f"| {row['what'].replace(', 1 slots', ', 1 slot').replace('_', '-')}, "
-            f"{row['physics'].replace('_', ' ')} | {row['worlds']} | "
-            f"{row['compile_seconds']:.1f} s | {row['env_steps_per_second']:,} | "
-            f"{ratio} |"
+            f"| {name}, {row['physics'].replace('_', ' ')} | {row['worlds']} | "
+            f"{row['compile_seconds']:.1f} s | {row['env_steps_per_second']:,} |"
         )
+    if "compile" in parts:
+        lines += ["", "| program | cold compile | warm |", "|---|---|---|"]
+        lines += [
+            f"| {row['physics'].replace('_', ' ')} | {row['cold']:.1f} s | "
+            f"{row['warm']:.1f} s |"
+            for row in parts["compile"]["rows"]
+        ]
+    if "update" in parts:
+        lines += [
+            "",
+            "| update of | slots x rows | critics | seconds | TFLOP | TFLOP/s "
+            "| matrix products alone | share |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
+        for row in parts["update"]["rows"]:
+            lines.append(
+                f"| {row['algorithm'].replace('_', '-')} | "
+                f"{row['slots']} x {row['rows']:,} | "
+                f"{row['precision']} | {row['seconds']:.2f} | "
+                f"{row['tera_flop']:.3f} | {row['tera_flop_per_second']:.3f} | "
+                f"{row['matmul_tera_flop_per_second']:.3f} | {row['share']:.0%} |"
+            )
     return "\n".join(lines) + "\n"
 
 
@@ -54,48 +84,73 @@ def with_physics(config: SearchConfig, physics: Any) -> SearchConfig:
     return dataclasses.replace(config, train=train)
 
 
+def with_precision(train: TrainConfig, precision: Precision) -> TrainConfig:
+    """The same training with critics of another precision."""
+    agent = dataclasses.replace(train.agent, critic_precision=precision)
+    return dataclasses.replace(train, agent=agent)
+
+
 def main() -> None:
     """Measure, print rows, write JSON and table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--preset", choices=PRESETS, default="laptop")
     parser.add_argument("--devices", type=int, default=None)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument(
+        "--precisions", nargs="+", choices=get_args(Precision), default=["float32"]
+    )
+    parser.add_argument("--update-slots", type=int, help="default: one a device")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder")
     options = parser.parse_args()
     devices = use_devices(options.devices)
     config = preset(options.preset)
     fast = with_physics(config, "closed_form")
-    rows: list[Speed] = []
-
-    def keep(new: list[Speed]) -> None:
-        for row in new:
-            print(json.dumps(row._asdict()), flush=True)
-        rows.extend(new)
-
-    if "mjx" in options.parts:
-        keep(search_speeds(config, devices))
-    if "closed_form" in options.parts:
-        keep(search_speeds(fast, devices))
-    for algorithm in config.algorithms if "slots" in options.parts else ():
-        keep(slot_speeds(fast.train, algorithm, SIZES, devices))
-    # What the whole search takes at these rates, compile and evaluation apart.
-    hours = {
-        row.physics: config.env_steps / row.env_steps_per_second / 3600
-        for row in rows
-        if row.what == "with updates"
-    }
-    facts = run_facts()
-    facts.pop("seed")
-    result = {
-        "command": " ".join(["python benchmarks/population.py", *sys.argv[1:]]),
-        "facts": facts,
-        "devices": len(devices),
-        "omnisafe": OMNISAFE,
-        "search_hours": {name: round(value, 4) for name, value in hours.items()},
-        "rows": [row._asdict() for row in rows],
+    measure: dict[str, Callable[[], list[Any]]] = {
+        "mjx": lambda: search_speeds(config, devices),
+        "closed_form": lambda: search_speeds(fast, devices),
+        "slots": lambda: [
+            row
+            for algorithm in config.algorithms
+            for row in slot_speeds(fast.train, algorithm, SIZES, devices)
+        ],
+        "devices": lambda: [
+            row
+            for algorithm in config.algorithms
+            for row in device_speeds(fast.train, algorithm, SIZES[-1], devices)
+        ],
+        "compile": lambda: [compile_times(kind, devices) for kind in (config, fast)],
+        "update": lambda: [
+            update_speed(
+                with_precision(fast.train, precision),
+                algorithm,
+                options.update_slots or len(devices),
+                devices,
+            )
+            for precision in options.precisions
+            for algorithm in config.algorithms
+        ],
     }
     file = options.out / f"population_{options.preset}.json"
-    print(json.dumps({"search_hours": result["search_hours"]}))
+    result: dict[str, Any] = {"parts": {}}
+    if file.exists():
+        result = json.loads(file.read_text())
+    for part in options.parts:
+        rows = [row._asdict() for row in measure[part]()]
+        for row in rows:
+            print(json.dumps(row), flush=True)
+        facts = run_facts()
+        facts.pop("seed")
+        result["parts"][part] = {
+            "command": " ".join(["python benchmarks/population.py", *sys.argv[1:]]),
+            "facts": facts,
+            "devices": len(devices),
+            "rows": rows,
+        }
+        # What the whole search takes at this rate, compile and evaluation apart.
+        for row in rows:
+            if row.get("what") == "with updates":
+                hours = config.env_steps / row["env_steps_per_second"] / 3600
+                result["parts"][part]["search_hours"] = round(hours, 4)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(result, indent=1) + "\n")
     file.with_suffix(".md").write_text(render(result))

@@ -88,11 +88,10 @@ def make_env(name_or_config: str | EnvConfig) -> Env:
     config = name_or_config
     if isinstance(config, str):
         config = env_config(config)
-    make = make_closed_form_world if config.physics == "closed_form" else make_world
     parts = _Parts(
         config=config,
         arena=layouts.make_arena(config),
-        world=make(config),
+        world=make_physics(config),
         task=make_task(config),
         constraint=make_constraint(config),
         observed=_observed_kinds(config),
@@ -113,6 +112,12 @@ def make_env(name_or_config: str | EnvConfig) -> Env:
         config=config,
         mj_model=world.mj_model,
     )
+
+
+def make_physics(config: EnvConfig) -> World:
+    """The physics of a configuration, without task, lidars and cost."""
+    make = make_closed_form_world if config.physics == "closed_form" else make_world
+    return make(config)
 
 
 def _observed_kinds(config: EnvConfig) -> tuple[str, ...]:
