@@ -1,14 +1,30 @@
 """The measuring itself: rows are of what they say, and bad sizes are refused."""
 
+import dataclasses
 import json
 
 import jax
+import jax.numpy as jnp
 import pytest
 
-from autocost_jax.bench import env_speed, slot_speeds
+from autocost_jax import bench
+from autocost_jax.bench import (
+    Speed,
+    compile_times,
+    device_speeds,
+    env_speed,
+    slot_speeds,
+    update_flop,
+    update_speed,
+)
 from autocost_jax.cli import main
 from autocost_jax.config import preset
+from autocost_jax.costs import training_cost
 from autocost_jax.env_config import EnvConfig
+from autocost_jax.envs.env import make_env
+from autocost_jax.population import make_agents
+from autocost_jax.records import CostInputs, Slot, Trajectory
+from scripts import load_script
 
 
 def test_env_speed_counts_worlds_and_compiles():
@@ -19,6 +35,102 @@ def test_env_speed_counts_worlds_and_compiles():
     assert speed.worlds == 8
     assert speed.compile_seconds > 0
     assert speed.env_steps_per_second > 100
+
+
+def test_physics_alone_is_less_than_a_step():
+    config = EnvConfig(physics="closed_form")
+    alone = env_speed(config, 64, jax.devices()[:1], physics_only=True)
+    assert alone.what == "physics alone"
+    whole = env_speed(config, 64, jax.devices()[:1])
+    assert alone.workspace_bytes < whole.workspace_bytes
+
+
+@pytest.fixture
+def rates(monkeypatch):
+    """Programs are not compiled; those that do not learn are twice as fast."""
+    calls = []
+
+    def speed(train, population, slots, what):
+        calls.append((population, slots[0].key.shape[0], what))
+        worlds = slots[0].key.shape[0] * train.num_worlds
+        rate = 1000 * len(calls)
+        return Speed("env", "physics", what, worlds, 0.0, rate, 0)
+
+    monkeypatch.setattr(bench, "_program_speed", speed)
+    monkeypatch.setattr(bench, "_matmul_rate", lambda width, devices: 1e12)
+    return calls
+
+
+def test_update_speed_is_the_difference_of_two_programs(rates):
+    train = preset("laptop").train
+    row = update_speed(train, "cpo", 3, jax.devices()[:1])
+    assert row.seconds == 12.0  # 24,000 steps at 1000 less at 2000 a second
+    flop = 3 * update_flop(train, "cpo", make_env(train.env))
+    assert row.tera_flop == round(flop / 1e12, 4)
+    assert row.share == round(flop / 12.0 / 1e12, 3)
+
+
+def test_device_speeds_take_powers_of_two(rates):
+    devices = jax.devices()[:1] * 3
+    rows = device_speeds(preset("smoke").train, "ppo_lagrangian", 4, devices[:1])
+    assert [row.what for row in rows] == ["ppo_lagrangian, 4 slots, 1 devices"]
+
+
+@pytest.mark.parametrize("algorithm", ["ppo_lagrangian", "cpo"])
+def test_update_flop_is_what_the_compiler_counts(algorithm):
+    """It counts the body of a loop once, so every loop is made to run once."""
+    train = preset("paper").train
+    agent = dataclasses.replace(
+        train.agent, policy_passes=1, value_passes=1, cg_iterations=1
+    )
+    env = EnvConfig(num_steps=100, physics="closed_form")
+    train = dataclasses.replace(train, agent=agent, num_worlds=4, env=env)
+    env = make_env(env)
+    (learner,) = make_agents((algorithm,), train, env)
+    state = jax.eval_shape(learner.init, jax.random.key(0))
+    shape = (100, 4)
+    row = jnp.zeros(shape)
+    inputs = CostInputs(row, jnp.zeros((*shape, 8)), row, row, row)
+    trajectory = Trajectory(
+        obs=jnp.zeros((101, 4, env.observation_size)),
+        action=jnp.zeros((*shape, env.action_size)),
+        reward=row,
+        cost_inputs=inputs,
+        valid=row,
+    )
+    slot = Slot(training_cost("extrinsic"), jax.random.key(0), jnp.ones(()))
+    lowered = jax.jit(learner.update).lower(
+        state, trajectory, row, slot, jax.random.key(0)
+    )
+    counted = lowered.compile().cost_analysis()["flops"]
+    # On top come the acting and first passes, a line search and all that is no product.
+    assert 0.6 * counted < update_flop(train, algorithm, env) < counted
+
+
+def test_a_warm_compile_reads_the_cache():
+    before = jax.config.jax_compilation_cache_dir
+    config = preset("smoke")
+    env = dataclasses.replace(config.train.env, physics="closed_form")
+    train = dataclasses.replace(config.train, env=env)
+    config = dataclasses.replace(config, train=train, algorithms=("ppo_lagrangian",))
+    times = compile_times(config, jax.devices()[:1])
+    assert 0 < times.warm < 0.7 * times.cold
+    assert jax.config.jax_compilation_cache_dir == before
+
+
+def test_a_peer_that_cannot_be_measured_says_why(monkeypatch, tmp_path):
+    peers = load_script("benchmarks/peers")
+    monkeypatch.setattr(peers, "HERE", tmp_path)
+    monkeypatch.setattr(peers.shutil, "which", lambda name: None)
+    with pytest.raises(peers.PeerError, match=r"no python3\.10 on the path"):
+        peers.measure_peer(peers.CASES[0])
+    (tmp_path / ".venv").mkdir()
+    with pytest.raises(peers.PeerError, match="ZeroDivisionError"):
+        peers.call([peers.sys.executable, "-c", "1 / 0"])
+    row = peers.CASES[-1]._asdict() | {"peer_rate": None, "why": "no pip", "rate": 1234}
+    table = peers.render({"rows": [row]})
+    assert "not measured: no pip" in table
+    assert "1,234" in table
 
 
 def test_programs_of_more_slots_have_more_worlds():
@@ -34,7 +146,6 @@ def test_programs_of_more_slots_have_more_worlds():
 
 def test_bench_prints_a_page_and_writes_json(monkeypatch, tmp_path, capsys):
     """The command, with the measuring of programs left to the tests above."""
-    from autocost_jax import bench
 
     def first_row(config, envs, batch, devices):
         yield bench.env_speed(envs[-1], batch, devices)

@@ -1,9 +1,7 @@
 """experiments/robots.py: what it counts, and that the README shows its results."""
 
-import importlib.util
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +10,7 @@ import pytest
 from autocost_jax import TrainConfig
 from autocost_jax.methods import Method, TableConfig
 from autocost_jax.store import RunDir
+from scripts import load_script
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results" / "robots"
@@ -19,17 +18,8 @@ RESULTS = ROOT / "experiments" / "results" / "robots"
 
 @pytest.fixture(scope="module")
 def robots():
-    """The script as a module; it imports its neighbour."""
-    file = ROOT / "experiments" / "robots.py"
-    spec = importlib.util.spec_from_file_location("robots", file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(file.parent))
-        spec.loader.exec_module(module)
-    yield module
-    sys.modules.pop("robots_tables", None)
+    """The script as a module."""
+    return load_script("experiments/robots")
 
 
 @pytest.fixture

@@ -198,10 +198,10 @@ from autocost_jax.arrays import flatten
 from autocost_jax.population import make_agents, make_population
 
 jax.config.update("jax_platforms", "cpu")
-jax.config.update("jax_num_cpu_devices", 3)
+jax.config.update("jax_num_cpu_devices", 8)
 jax.config.update("jax_enable_x64", True)
 collectives = {{}}
-for count in (1, 2, 3):
+for count in (1, 2, 3, 8):
     env = make_toy_env()
     if {toy!r}:
         agents = (linear_agent(env), linear_agent(env))
@@ -224,7 +224,7 @@ print(json.dumps(collectives))
     scope="module", params=["toy", pytest.param("real", marks=pytest.mark.slow)]
 )
 def devices(request, tmp_path_factory):
-    """Three slots on 1, 2 (padded) and 3 devices: collectives found, and results.
+    """Three slots on 1, 2, 8 (padded) and 3 devices: collectives found, and results.
 
     In a process of its own, because a CPU is split into devices once; and without
     LLVM's optimisations, which see neither the partition nor a collective. In
@@ -245,16 +245,16 @@ def devices(request, tmp_path_factory):
     assert done.returncode == 0, done.stderr
     results = {
         count: dict(np.load(out / f"{count}.npz", allow_pickle=False))
-        for count in (1, 2, 3)
+        for count in (1, 2, 3, 8)
     }
     return json.loads(done.stdout.splitlines()[-1]), results
 
 
 def test_devices_do_not_talk(devices):
-    assert devices[0] == {"1": [], "2": [], "3": []}
+    assert devices[0] == {"1": [], "2": [], "3": [], "8": []}
 
 
-@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("count", [2, 3, 8])
 def test_any_number_of_devices_gives_the_same_numbers(devices, count):
     one, many = devices[1][1], devices[1][count]
     assert one.keys() == many.keys()

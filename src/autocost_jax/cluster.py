@@ -33,18 +33,24 @@ def join(
     Raises:
       ValueError: for an incomplete or contradictory description.
     """
-    numbers = (num_processes, process_id)
     if coordinator is None:
-        if numbers != (None, None):
+        if (num_processes, process_id) != (None, None):
             raise ValueError("num_processes and process_id need a coordinator")
         return
+    known = _description(coordinator, num_processes, process_id)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.distributed.initialize(**known)
+    wait_for_all()  # on CPUs connections are made within 30 s of each other, or never
+
+
+def _description(
+    coordinator: str, num_processes: int | None, process_id: int | None
+) -> dict[str, Any]:
+    """What JAX is told of the processes; nothing where it is to ask the cluster."""
     if coordinator == AUTO:
-        if numbers != (None, None):
+        if (num_processes, process_id) != (None, None):
             raise ValueError("with coordinator=auto leave out the other two")
-        jax.distributed.initialize()
-        wait_for_all()
-        return
+        return {}
     if num_processes is None or process_id is None:
         raise ValueError(
             "a coordinator needs num_processes and process_id, "
@@ -57,12 +63,11 @@ def join(
     host, _, port = coordinator.rpartition(":")
     if not host or not port.isdigit():
         raise ValueError(f"coordinator must be auto or HOST:PORT, got {coordinator}")
-    jax.distributed.initialize(
-        coordinator_address=coordinator,
-        num_processes=num_processes,
-        process_id=process_id,
-    )
-    wait_for_all()  # on CPUs connections are made within 30 s of each other, or never
+    return {
+        "coordinator_address": coordinator,
+        "num_processes": num_processes,
+        "process_id": process_id,
+    }
 
 
 def is_first() -> bool:

@@ -83,12 +83,11 @@ def run_epoch(
     Returns:
       Learners, and for each group metrics [P_g].
     """
-    worlds, trajectory, start = _rollout(env, agents, config, learners, slots, epoch)
-    travelled = _travelled(worlds, start)
+    worlds, seen = _rollout(env, agents, config, learners, slots, epoch)
     learners = _carry(config, learners, slots, worlds)
     after, metrics = [], []
-    for agent, learner, slot, part in zip(
-        agents, learners, slots, _parts(slots), strict=True
+    for agent, learner, slot, (trajectory, counts) in zip(
+        agents, learners, slots, seen, strict=True
     ):
 
         def update(learner: Learner, slot: Slot, trajectory, counts, agent=agent):
@@ -96,11 +95,7 @@ def run_epoch(
                 env, agent, config, learner, slot, trajectory, counts, epoch, bank
             )
 
-        group_trajectory = jax.tree.map(
-            lambda x, part=part: jnp.moveaxis(x[:, part], 1, 0), trajectory
-        )
-        counts = jax.tree.map(lambda x, part=part: x[part], travelled)
-        inputs = (learner.replace(worlds=None), slot, group_trajectory, counts)
+        inputs = (learner.replace(worlds=None), slot, trajectory, counts)
         learned, group_metrics = _map_slots(config, update, inputs)
         after.append(learned.replace(worlds=learner.worlds))
         metrics.append(group_metrics)
@@ -132,7 +127,7 @@ def start_cohorts(
 
     def warm_up(learners: tuple[Learner, ...], segment: jax.Array):
         # Negative epochs: their keys are not those of any training epoch.
-        worlds, _, _ = _rollout(env, agents, config, learners, slots, -1 - segment)
+        worlds, _ = _rollout(env, agents, config, learners, slots, -1 - segment)
         return _carry(config, learners, slots, worlds), None
 
     learners, _ = jax.lax.scan(warm_up, learners, jnp.arange(segments - 1))
@@ -165,8 +160,7 @@ def final_episodes(
 
     def play(carry: None, index: jax.Array):
         epoch = config.num_epochs + index  # no epoch has this number
-        worlds, trajectory, start = _rollout(env, agents, whole, fresh, slots, epoch)
-        counts = _travelled(worlds, start)
+        _, seen = _rollout(env, agents, whole, fresh, slots, epoch)
 
         def one(slot: Slot, trajectory: Trajectory, counts: Metrics) -> Metrics:
             cost = trajectory.cost_inputs.cost
@@ -174,12 +168,9 @@ def final_episodes(
             metrics |= awareness(trajectory, slot.cost.theta)
             return metrics | {name: jnp.mean(x) for name, x in counts.items()}
 
-        metrics = []
-        for slot, part in zip(slots, _parts(slots), strict=True):
-            mine = jax.tree.map(lambda x, part=part: x[:, part], trajectory)
-            mine_counts = jax.tree.map(lambda x, part=part: x[part], counts)
-            metrics.append(jax.vmap(one, in_axes=(0, 1, 0))(slot, mine, mine_counts))
-        return carry, tuple(metrics)
+        return carry, tuple(
+            jax.vmap(one)(slot, *group) for slot, group in zip(slots, seen, strict=True)
+        )
 
     return jax.lax.scan(play, None, jnp.arange(num_rounds, dtype=jnp.int32))[1]
 
@@ -267,15 +258,6 @@ def _map_slots(config: TrainConfig, function: Callable[..., Any], inputs: Any) -
     return jax.lax.map(lambda slot: function(*slot), inputs, batch_size=chunk)
 
 
-def _travelled(worlds: EnvState, start: EnvState) -> Metrics:
-    """The environment's counters from `start` on, float32."""
-    return jax.tree.map(
-        lambda end, begin: (end - begin).astype(jnp.float32),
-        worlds.metrics,
-        start.metrics,
-    )
-
-
 def _parts(slots: tuple[Slot, ...]) -> list[slice]:
     """Where each group lies on the joined slot axis."""
     parts, start = [], 0
@@ -292,11 +274,11 @@ def _rollout(
     learners: tuple[Learner, ...],
     slots: tuple[Slot, ...],
     epoch: jax.Array,
-) -> tuple[EnvState, Trajectory, EnvState]:
+) -> tuple[EnvState, list[tuple[Trajectory, Metrics]]]:
     """All slots of all groups in one batch of worlds [sum P_g, k N, ...].
 
-    Returns the worlds after the epoch, the trajectory [T, sum P_g, k N, ...] and the
-    worlds before it.
+    Returns the worlds after the epoch, and for each group what its slots saw: the
+    trajectories [P_g, T, k N, ...] and the environment's counters [P_g, k N], float32.
     """
 
     def keys(purpose: int) -> list[Key]:
@@ -328,7 +310,17 @@ def _rollout(
 
     step = jax.vmap(jax.vmap(env.step))
     worlds, trajectory = unroll_batch(step, act, start, config.epoch_steps)
-    return worlds, trajectory, start
+    counters = jax.tree.map(
+        lambda after, before: (after - before).astype(jnp.float32),
+        worlds.metrics,
+        start.metrics,
+    )
+    slot_first = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), trajectory)
+    seen = [
+        jax.tree.map(lambda x, part=part: x[part], (slot_first, counters))
+        for part in parts
+    ]
+    return worlds, seen
 
 
 def _update(
