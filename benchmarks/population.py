@@ -5,7 +5,7 @@
     python benchmarks/population.py --preset laptop --parts devices --devices 8
 
 See `autocost_jax.bench`: the search's program and what it is made of (mjx,
-closed_form); one algorithm's programs of 1 to 16 slots, on at most one device a slot
+closed_form); one algorithm's programs of 1 to 100 slots, on at most one device a slot
 (slots); 16 slots on 1, 2, 4 ... devices (devices); a compile without and with a cache
 (compile); updates against the devices' own matrix products (update). Writes
 benchmarks/results/population_PRESET.json and the table of it; parts that are not asked
@@ -33,7 +33,7 @@ from autocost_jax.config import Precision, SearchConfig, TrainConfig
 from autocost_jax.store import run_facts
 
 RESULTS = Path(__file__).parent / "results"
-SIZES = (1, 4, 16)
+SIZES, DEALT = (1, 4, 16, 100), 16
 PARTS = ("mjx", "closed_form", "slots", "devices", "compile", "update")
 
 
@@ -42,15 +42,16 @@ def render(result: dict[str, Any]) -> str:
     parts = result["parts"]
     rows = [row for part in PARTS[:4] for row in parts.get(part, {}).get("rows", ())]
     lines = [
-        "| program | worlds | cold compile | env steps/s |",
-        "|---|---|---|---|",
+        "| program | worlds | cold compile | workspace of a device | env steps/s |",
+        "|---|---|---|---|---|",
     ]
     for row in rows:
         name = row["what"].replace(", 1 slots", ", 1 slot").replace("_", "-")
         name = name.replace(", 1 devices", ", 1 device")
         lines.append(
             f"| {name}, {row['physics'].replace('_', ' ')} | {row['worlds']} | "
-            f"{row['compile_seconds']:.1f} s | {row['env_steps_per_second']:,} |"
+            f"{row['compile_seconds']:.1f} s | {row['workspace_bytes'] / 1e6:.1f} MB | "
+            f"{row['env_steps_per_second']:,} |"
         )
     if "compile" in parts:
         lines += ["", "| program | cold compile | warm |", "|---|---|---|"]
@@ -116,7 +117,7 @@ def main() -> None:
         "devices": lambda: [
             row
             for algorithm in config.algorithms
-            for row in device_speeds(fast.train, algorithm, SIZES[-1], devices)
+            for row in device_speeds(fast.train, algorithm, DEALT, devices)
         ],
         "compile": lambda: [compile_times(kind, devices) for kind in (config, fast)],
         "update": lambda: [

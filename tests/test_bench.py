@@ -102,20 +102,22 @@ def test_update_flop_is_what_the_compiler_counts(algorithm):
     lowered = jax.jit(learner.update).lower(
         state, trajectory, row, slot, jax.random.key(0)
     )
-    counted = lowered.compile().cost_analysis()["flops"]
+    analysis = lowered.compile().cost_analysis()
+    assert analysis is not None
+    counted = analysis["flops"]
     # On top come the acting and first passes, a line search and all that is no product.
     assert 0.6 * counted < update_flop(train, algorithm, env) < counted
 
 
 def test_a_warm_compile_reads_the_cache():
-    before = jax.config.jax_compilation_cache_dir
+    before = getattr(jax.config, "jax_compilation_cache_dir", None)
     config = preset("smoke")
     env = dataclasses.replace(config.train.env, physics="closed_form")
     train = dataclasses.replace(config.train, env=env)
     config = dataclasses.replace(config, train=train, algorithms=("ppo_lagrangian",))
     times = compile_times(config, jax.devices()[:1])
     assert 0 < times.warm < 0.7 * times.cold
-    assert jax.config.jax_compilation_cache_dir == before
+    assert getattr(jax.config, "jax_compilation_cache_dir", None) == before
 
 
 def test_a_peer_that_cannot_be_measured_says_why(monkeypatch, tmp_path):
