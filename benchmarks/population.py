@@ -41,10 +41,12 @@ def render(result: dict[str, Any]) -> str:
     """The tables of the README, a part each."""
     parts = result["parts"]
     rows = [row for part in PARTS[:4] for row in parts.get(part, {}).get("rows", ())]
-    lines = [
-        "| program | worlds | cold compile | workspace of a device | env steps/s |",
-        "|---|---|---|---|---|",
-    ]
+    lines = []
+    if rows:
+        lines += [
+            "| program | worlds | cold compile | workspace of a device | env steps/s |",
+            "|---|---|---|---|---|",
+        ]
     for row in rows:
         name = row["what"].replace(", 1 slots", ", 1 slot").replace("_", "-")
         name = name.replace(", 1 devices", ", 1 device")
@@ -75,7 +77,7 @@ def render(result: dict[str, Any]) -> str:
                 f"{row['tera_flop']:.3f} | {row['tera_flop_per_second']:.3f} | "
                 f"{row['matmul_tera_flop_per_second']:.3f} | {row['share']:.0%} |"
             )
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines).strip() + "\n"
 
 
 def with_physics(config: SearchConfig, physics: Any) -> SearchConfig:

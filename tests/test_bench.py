@@ -27,6 +27,11 @@ from autocost_jax.records import CostInputs, Slot, Trajectory
 from scripts import load_script
 
 
+def closed_form(env):
+    """The same world, compiled sooner."""
+    return dataclasses.replace(env, physics="closed_form")
+
+
 def test_env_speed_counts_worlds_and_compiles():
     config = EnvConfig(physics="closed_form")
     speed = env_speed(config, 8, jax.devices()[:1])
@@ -112,8 +117,7 @@ def test_update_flop_is_what_the_compiler_counts(algorithm):
 def test_a_warm_compile_reads_the_cache():
     before = getattr(jax.config, "jax_compilation_cache_dir", None)
     config = preset("smoke")
-    env = dataclasses.replace(config.train.env, physics="closed_form")
-    train = dataclasses.replace(config.train, env=env)
+    train = dataclasses.replace(config.train, env=closed_form(config.train.env))
     config = dataclasses.replace(config, train=train, algorithms=("ppo_lagrangian",))
     times = compile_times(config, jax.devices()[:1])
     assert 0 < times.warm < 0.7 * times.cold
@@ -137,6 +141,7 @@ def test_a_peer_that_cannot_be_measured_says_why(monkeypatch, tmp_path):
 
 def test_programs_of_more_slots_have_more_worlds():
     train = preset("smoke").train
+    train = dataclasses.replace(train, env=closed_form(train.env))
     rows = slot_speeds(train, "ppo_lagrangian", (1, 3), jax.devices()[:1])
     assert [row.worlds for row in rows] == [train.num_worlds, 3 * train.num_worlds]
     assert [row.what for row in rows] == [
