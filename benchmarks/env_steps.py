@@ -1,7 +1,7 @@
 """How fast each of the twelve worlds steps, and how long it compiles.
 
-    python benchmarks/env_steps.py                     # all, batches 128 and 1024
-    python benchmarks/env_steps.py --only Goal-Hazard-Car --batch 4096
+    python benchmarks/env_steps.py                     # all, batch 1024
+    python benchmarks/env_steps.py --only Goal-Hazard-Car --batch 128 8192
 
 See `autocost_jax.bench.env_speed` for what a step is; `peers.py` compares. Writes
 benchmarks/results/env_steps.json and the table of it; `--only` and `--batch` renew some
@@ -57,7 +57,7 @@ def main() -> None:
     """Measure, print rows, write JSON and table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=NAMES, default=NAMES)
-    parser.add_argument("--batch", type=int, nargs="+", default=(128, 1024))
+    parser.add_argument("--batch", type=int, nargs="+", default=(1024,))
     parser.add_argument("--out", type=Path, default=RESULT)
     options = parser.parse_args()
     devices = use_devices(None)

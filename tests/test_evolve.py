@@ -21,7 +21,8 @@ from autocost_jax.evolve import main
 from autocost_jax.store import RunDirError, list_stages, read_config, read_metrics
 from autocost_jax.summary import load_report
 
-SMOKE = ["--preset", "smoke", "--eval-episodes", "4", "--seed", "3"]
+SMOKE = ["--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "4"]
+SMOKE += ["--seed", "3"]
 WAIT = 400  # seconds until a subprocess counts as hung; they take 10 to 60
 
 
