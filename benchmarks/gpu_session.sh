@@ -4,9 +4,10 @@
 #     bash benchmarks/gpu_session.sh [OUT]
 #
 # Writes JSON and tables to OUT (default: benchmarks/results/gpu): time of a step against
-# batch in MJX and in closed form, the `search` and `paper` programs with the projection
-# of the paper's whole evolution (search_hours), programs of 1 to 16 slots, and a whole
-# run of the `search` preset. A part that fails does not stop the others.
+# batch in MJX and in closed form, the `paper` program with the projection of the paper's
+# whole evolution (search_hours), its update in three precisions, the `search` program,
+# programs of 1 to 100 slots, and a whole run of the `search` preset. A part that fails
+# does not stop the others.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 out="${1:-benchmarks/results/gpu}"
@@ -22,13 +23,10 @@ part() {
 }
 
 nvidia-smi >"$out/nvidia-smi.txt" 2>&1
-for batch in 1024 8192 65536; do
-    part "env_steps_$batch" 90 python benchmarks/env_steps.py --batch "$batch" \
-        --only "Goal-Hazard-Point, closed form" Goal-Hazard-Point \
-        --out "$out/env_steps_$batch.json"
-done
-part paper 150 python benchmarks/population.py --preset paper --parts closed_form mjx --out "$out"
-part update 120 python benchmarks/population.py --preset paper --parts update --update-slots 50 \
+part env_steps 135 python benchmarks/env_steps.py --batch 1024 8192 65536 \
+    --only "Goal-Hazard-Point, closed form" Goal-Hazard-Point --out "$out/env_steps.json"
+part paper 120 python benchmarks/population.py --preset paper --parts closed_form mjx --out "$out"
+part update 100 python benchmarks/population.py --preset paper --parts update --update-slots 50 \
     --precisions float32 tensorfloat32 bfloat16 --out "$out"
-part search 120 python benchmarks/population.py --preset search --parts closed_form slots --out "$out"
-part run 180 python -m autocost_jax.evolve --preset search --physics closed_form --out "$out/run"
+part search 95 python benchmarks/population.py --preset search --parts closed_form slots --out "$out"
+part run 150 python -m autocost_jax.evolve --preset search --physics closed_form --out "$out/run"

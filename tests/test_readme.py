@@ -146,6 +146,7 @@ def test_the_tables_are_those_of_the_committed_json(script, result):
         "--no-compile-cache",
         "--segments-per-episode",
         "--population-chunk",
+        "--critic-precision",
         "--coordinator",
         "--num-processes",
         "--process-id",
