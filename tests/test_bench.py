@@ -75,10 +75,16 @@ def test_update_speed_is_the_difference_of_two_programs(rates):
     assert row.share == round(flop / 12.0 / 1e12, 3)
 
 
-def test_device_speeds_take_powers_of_two(rates):
-    devices = jax.devices()[:1] * 3
-    rows = device_speeds(preset("smoke").train, "ppo_lagrangian", 4, devices[:1])
-    assert [row.what for row in rows] == ["ppo_lagrangian, 4 slots, 1 devices"]
+@pytest.mark.parametrize(("there", "taken"), [(1, [1]), (3, [1, 2]), (8, [1, 2, 4, 8])])
+def test_device_speeds_take_powers_of_two(rates, monkeypatch, there, taken):
+    monkeypatch.setattr(
+        bench, "make_population", lambda env, agents, train, devices: devices
+    )
+    devices = list(range(there))
+    rows = device_speeds(preset("smoke").train, "ppo_lagrangian", 4, devices)
+    expect = [f"ppo_lagrangian, 4 slots, {count} devices" for count in taken]
+    assert [row.what for row in rows] == expect
+    assert [call[0] for call in rates] == [devices[:count] for count in taken]
 
 
 @pytest.mark.parametrize("algorithm", ["ppo_lagrangian", "cpo"])

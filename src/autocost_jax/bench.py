@@ -211,36 +211,37 @@ def slot_speeds(
 
     One slot is what an ordinary run trains; N of them in turn take N times as long.
     """
-    env = make_env(train.env)
-    agents = make_agents((algorithm,), train, env)
-    return [
-        _program_speed(
-            train,
-            make_population(env, agents, train, devices=devices[:size]),
-            (_slots(size),),
-            f"{algorithm}, {size} slots",
-        )
-        for size in sizes
-    ]
+    programs = [(size, devices[:size], f"{size} slots") for size in sizes]
+    return _algorithm_speeds(train, algorithm, programs)
 
 
 def device_speeds(
     train: TrainConfig, algorithm: Algorithm, size: int, devices: Sequence[Any]
 ) -> list[Speed]:
     """One program of `size` slots on 1, 2, 4, 8 ... of the devices."""
+    counts = [2**power for power in range(len(devices).bit_length())]
+    programs = [
+        (size, devices[:count], f"{size} slots, {count} devices") for count in counts
+    ]
+    return _algorithm_speeds(train, algorithm, programs)
+
+
+def _algorithm_speeds(
+    train: TrainConfig,
+    algorithm: Algorithm,
+    programs: Sequence[tuple[int, Sequence[Any], str]],
+) -> list[Speed]:
+    """Programs of one algorithm: how many slots, on which devices, called what."""
     env = make_env(train.env)
     agents = make_agents((algorithm,), train, env)
-    counts = itertools.takewhile(
-        lambda count: count <= len(devices), (2**power for power in itertools.count())
-    )
     return [
         _program_speed(
             train,
-            make_population(env, agents, train, devices=devices[:count]),
+            make_population(env, agents, train, devices=devices),
             (_slots(size),),
-            f"{algorithm}, {size} slots, {count} devices",
+            f"{algorithm}, {what}",
         )
-        for count in counts
+        for size, devices, what in programs
     ]
 
 
