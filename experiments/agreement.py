@@ -9,18 +9,16 @@ precision. `--only NAME ...` takes some variants, `--smoke` shrinks everything t
 minute. Results are written to experiments/results/agreement/ (reduced scale).
 """
 
-import argparse
 import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from common import compact, run_if_needed, t_interval
+from common import Options, compact, run_if_needed, run_part, t_interval
 
 from autocost_jax import TrainConfig, env_config, preset
-from autocost_jax.commandline import use_devices
 from autocost_jax.methods import Method, TableConfig
 from autocost_jax.rundata import to_json
 from autocost_jax.store import read_config, read_metrics, run_facts
@@ -38,26 +36,10 @@ EPOCHS, SEEDS, EPISODES = 100, tuple(range(10)), 50
 SCORES = ("return_mean", "cost_mean")
 
 
-class Options(NamedTuple):
-    """Where things go, and how much of them.
-
-    Attributes:
-      runs: directory of the run directories.
-      results: directory of the JSON, table and figure.
-      only: variants.
-      smoke: the smallest size at which every line of code runs.
-    """
-
-    runs: Path
-    results: Path
-    only: tuple[str, ...]
-    smoke: bool
-
-
 def run(options: Options) -> None:
     """Train both algorithms with limit 0 in every variant."""
     methods = tuple(Method(name, name) for name in ALGORITHMS)
-    for name in options.only:
+    for name in options.only or VARIANTS:
         train = variant(name, options.smoke)
         seeds = SEEDS[:2] if options.smoke else SEEDS
         config = TableConfig(train, methods, seeds)
@@ -215,21 +197,5 @@ def draw(result: dict[str, Any], file: Path) -> None:
 PARTS: dict[str, Callable[[Options], None]] = {"run": run, "collect": collect}
 
 
-def main() -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=PARTS)
-    parser.add_argument("--only", nargs="+", choices=VARIANTS, default=tuple(VARIANTS))
-    parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--runs", type=Path, help="default: runs/agreement")
-    parser.add_argument("--results", type=Path)
-    args = parser.parse_args()
-    runs = args.runs or Path("runs/agreement_smoke" if args.smoke else "runs/agreement")
-    where = runs / "results" if args.smoke else Path("experiments/results/agreement")
-    options = Options(runs, args.results or where, tuple(args.only), args.smoke)
-    use_devices(None)  # a device a core, before anything of JAX runs
-    PARTS[args.part](options)
-
-
 if __name__ == "__main__":
-    main()
+    run_part("agreement", __doc__, PARTS, VARIANTS)

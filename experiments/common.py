@@ -1,15 +1,61 @@
-"""What several experiments need: tables that continue, statistics, compact JSON."""
+"""What several experiments need: a command line, tables that continue, statistics."""
 
+import argparse
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from autocost_jax.commandline import use_devices
 from autocost_jax.methods import TableConfig, run_table
+
+
+class Options(NamedTuple):
+    """Where things go, and how much of them.
+
+    Attributes:
+      runs: directory of the run directories.
+      results: directory of the JSON, tables and figures.
+      only: what of the experiment's worlds or variants; empty for all.
+      smoke: the smallest size at which every line of code runs.
+    """
+
+    runs: Path
+    results: Path
+    only: tuple[str, ...] = ()
+    smoke: bool = False
+
+
+def run_part(
+    name: str,
+    description: str | None,
+    parts: Mapping[str, Callable[[Options], None]],
+    choices: Iterable[str],
+) -> None:
+    """The command line of an experiment: one of its parts, on a device a core.
+
+    Args:
+      name: of its folders under runs/ and experiments/results/.
+      description: what `--help` says.
+      parts: what can be asked for.
+      choices: what `--only` may name.
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("part", choices=parts)
+    parser.add_argument("--only", nargs="+", choices=choices, default=())
+    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--runs", type=Path, help=f"default: runs/{name}")
+    parser.add_argument("--results", type=Path)
+    args = parser.parse_args()
+    runs = args.runs or Path(f"runs/{name}_smoke" if args.smoke else f"runs/{name}")
+    where = runs / "results" if args.smoke else Path(f"experiments/results/{name}")
+    options = Options(runs, args.results or where, tuple(args.only), args.smoke)
+    use_devices(None)  # a device a core, before anything of JAX runs
+    parts[args.part](options)
 
 
 def run_if_needed(config: TableConfig, path: Path, num_episodes: int) -> None:

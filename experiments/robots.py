@@ -10,7 +10,6 @@ takes some of a part's worlds, `--smoke` shrinks everything to a minute. Results
 written to experiments/results/robots/.
 """
 
-import argparse
 import dataclasses
 import json
 from collections.abc import Callable, Sequence
@@ -20,12 +19,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import compact, run_if_needed, t_interval
+from common import Options, compact, run_if_needed, run_part, t_interval
 from robots_tables import ALGORITHMS, draw, render
 
 from autocost_jax import Agent, EnvConfig, TrainConfig, env_config, make_env, preset
 from autocost_jax.arrays import write_atomic
-from autocost_jax.commandline import use_devices
 from autocost_jax.methods import Learners, Method, TableConfig, table_slots
 from autocost_jax.policies import EVALUATION, eval_summary
 from autocost_jax.population import make_agents, make_evaluator
@@ -89,22 +87,6 @@ LIMIT_TABLES = {
 
 CURVES = ("ep_return", "ep_cost", "kl", "multiplier", "case", "accepted")
 NO_STATE = ("intrinsic_far", "intrinsic_near")  # NaN where no such state was visited
-
-
-class Options(NamedTuple):
-    """Where things go, and how much of them.
-
-    Attributes:
-      runs: directory of the run directories.
-      results: directory of the JSON, tables and figures.
-      only: worlds; empty for all.
-      smoke: the smallest size at which every line of code runs.
-    """
-
-    runs: Path
-    results: Path
-    only: tuple[str, ...] = ()
-    smoke: bool = False
 
 
 def run_all(options: Options) -> None:
@@ -336,21 +318,5 @@ PARTS: dict[str, Callable[[Options], None]] = {
 }
 
 
-def main() -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=PARTS)
-    parser.add_argument("--only", nargs="+", choices=RUN_WORLDS, default=())
-    parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--runs", type=Path, help="default: runs/robots")
-    parser.add_argument("--results", type=Path)
-    args = parser.parse_args()
-    runs = args.runs or Path("runs/robots_smoke" if args.smoke else "runs/robots")
-    where = runs / "results" if args.smoke else Path("experiments/results/robots")
-    options = Options(runs, args.results or where, tuple(args.only), args.smoke)
-    use_devices(None)  # a device a core, before anything of JAX runs
-    PARTS[args.part](options)
-
-
 if __name__ == "__main__":
-    main()
+    run_part("robots", __doc__, PARTS, RUN_WORLDS)
