@@ -21,6 +21,7 @@ from autocost_jax.env_config import EnvConfig
 
 Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
+Start = Literal["normal", "monotone"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 THETA_SIZE = 41
 
@@ -170,6 +171,11 @@ class SearchConfig:
     `segments_per_episode` > 1 over as many whole fresh episodes), "zero violation" =
     a mean extrinsic cost <= `zero_tolerance` over those episodes.
     `selection="random"` replaces the ranking by a random choice: the control.
+
+    Two options of ours beside the paper's rule. `start="monotone"` draws first costs
+    that rise as anything comes nearer and are small at a typical place, see
+    `es.monotone_start`. With a `return_floor` a candidate of a lower return ranks
+    behind all others, however safe it is, see `es.rank`.
     """
 
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -186,6 +192,8 @@ class SearchConfig:
     mutation_high: float = 2.0
     zero_tolerance: float = 0.0
     selection: Selection = "paper"
+    start: Start = "normal"
+    return_floor: float | None = None
 
     def __post_init__(self) -> None:
         require_counts(
@@ -222,13 +230,11 @@ class SearchConfig:
         tolerance = self.zero_tolerance
         ok = is_finite(tolerance) and tolerance >= 0
         require(ok, "zero_tolerance", "finite and >= 0", tolerance)
-        selections = ("paper", "random")
-        require(
-            self.selection in selections,
-            "selection",
-            f"one of {', '.join(selections)}",
-            self.selection,
-        )
+        for name, kind in (("selection", Selection), ("start", Start)):
+            value, known = getattr(self, name), get_args(kind)
+            require(value in known, name, f"one of {', '.join(known)}", value)
+        floor = self.return_floor
+        require(floor is None or is_finite(floor), "return_floor", "finite", floor)
         ok = is_integer(self.seed) and 0 <= self.seed < 2**32
         require(ok, "seed", "an integer in [0, 2**32)", self.seed)
 

@@ -50,12 +50,17 @@ def intrinsic_cost(theta: jax.Array, lidar: jax.Array) -> jax.Array:
     Source: He, Zhao & Liu 2023, section "Experiment Setting"; the sigmoid of the
     hidden layer and the parameter layout are ours.
     """
+    return jax.nn.sigmoid(intrinsic_logit(theta, lidar))
+
+
+def intrinsic_logit(theta: jax.Array, lidar: jax.Array) -> jax.Array:
+    """What the output sigmoid of `intrinsic_cost` is taken of, [...]."""
     split = LIDAR_BINS * HIDDEN
     w1 = theta[:split].reshape(LIDAR_BINS, HIDDEN)
     b1, w2, b2 = theta[split : split + HIDDEN], theta[split + HIDDEN : -1], theta[-1]
     # Bins first: eight multiply-adds fuse where a [.., 8] x [8, 4] matmul would not.
     pre = b1 + sum(lidar[..., i, None] * w1[i] for i in range(LIDAR_BINS))
-    return jax.nn.sigmoid(jnp.sum(jax.nn.sigmoid(pre) * w2, axis=-1) + b2)
+    return jnp.sum(jax.nn.sigmoid(pre) * w2, axis=-1) + b2
 
 
 def _extrinsic(inputs: CostInputs, theta: jax.Array) -> jax.Array:

@@ -16,7 +16,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from autocost_jax.config import THETA_SIZE, SearchConfig
+from autocost_jax.costs import HIDDEN, intrinsic_logit
 from autocost_jax.records import Key
+
+QUIET_COST = 0.01  # of a `monotone_start` at a typical place
 
 
 class Fitness(struct.PyTreeNode):
@@ -82,22 +85,37 @@ class ES(NamedTuple):
     tell: Callable[[Key, ESState, Any, Fitness], ESState]
 
 
-def rank(fitness: Fitness, zero_tolerance: float = 0.0) -> jax.Array:
+def rank(
+    fitness: Fitness, zero_tolerance: float = 0.0, return_floor: float | None = None
+) -> jax.Array:
     """Indices [P], best first: cost (<= tolerance counts as 0), then return.
 
     One lexicographic sort covers both branches of the paper's rule: with more
     zero-violation candidates than elites the highest returns win, otherwise the lowest
     costs. Anything non-finite comes last.
+
+    The option `return_floor` is not the paper's: candidates of a lower return come
+    after all others and are compared by return alone (the feasibility rule of Deb 2000,
+    "An efficient constraint handling method for genetic algorithms"). Without it costs
+    that make agents flee or stand still win, as they are the first to be safe.
     """
     ok = jnp.isfinite(fitness.cost) & jnp.isfinite(fitness.ep_return)
     cost = jnp.where(fitness.cost <= zero_tolerance, 0.0, fitness.cost)
     cost = jnp.where(ok, cost, jnp.inf)
     loss = jnp.where(ok, -fitness.ep_return, jnp.inf)
-    return jnp.lexsort((loss, cost))
+    if return_floor is None:
+        return jnp.lexsort((loss, cost))
+    is_low = ok & (fitness.ep_return < return_floor)
+    cost = jnp.where(is_low, 0.0, cost)
+    return jnp.lexsort((loss, cost, is_low | ~ok, ~ok))
 
 
 def select(
-    candidates: Any, fitness: Fitness, num_elites: int, zero_tolerance: float = 0.0
+    candidates: Any,
+    fitness: Fitness,
+    num_elites: int,
+    zero_tolerance: float = 0.0,
+    return_floor: float | None = None,
 ) -> tuple[Any, jax.Array]:
     """The best candidates and their indices, in rank order.
 
@@ -106,6 +124,7 @@ def select(
       fitness: fields [P].
       num_elites: E.
       zero_tolerance: cost up to which a candidate counts as free of violations.
+      return_floor: see `rank`.
 
     Returns:
       Elites, stacked [E, ...], and their indices [E].
@@ -116,7 +135,7 @@ def select(
     size = fitness.cost.shape[0]
     if not 1 <= num_elites <= size:
         raise ValueError(f"num_elites must be in [1, {size}], got {num_elites}")
-    index = rank(fitness, zero_tolerance)[:num_elites]
+    index = rank(fitness, zero_tolerance, return_floor)[:num_elites]
     return jax.tree.map(lambda x: x[index], candidates), index
 
 
@@ -158,11 +177,46 @@ def mutate(
     return treedef.unflatten(children)
 
 
-def truncation_es(config: SearchConfig) -> ES:
+def monotone_start(key: Key, num: int, std: float, lidars: jax.Array) -> jax.Array:
+    """Random costs that never fall as anything comes nearer; not the paper's start.
+
+    Weights are |N(0, std^2)|, hidden units turn on around the mean lidar (their biases
+    are N(0, std^2) from there), and the output bias makes the median cost over `lidars`
+    0.01. Of such networks about half are quiet far from hazards and loud near them, of
+    normal ones of the same std 6 in 1000 (default worlds, std 5).
+
+    Args:
+      key: consumed.
+      num: P.
+      std: scale of the parameters.
+      lidars: [M, 8] readings at typical places.
+
+    Returns:
+      theta [P, 41].
+    """
+    theta = std * jax.random.normal(key, (num, THETA_SIZE), lidars.dtype)
+    bins = lidars.shape[-1]
+    inner = jnp.abs(theta[:, : bins * HIDDEN])
+    middle = jnp.einsum("b,pbh->ph", lidars.mean(0), inner.reshape(num, bins, HIDDEN))
+    bias = theta[:, bins * HIDDEN : -HIDDEN - 1] - middle
+    outer = jnp.abs(theta[:, -HIDDEN - 1 : -1])
+    theta = jnp.concatenate([inner, bias, outer, jnp.zeros((num, 1))], axis=1)
+    logits = jax.vmap(lambda theta: intrinsic_logit(theta, lidars))(theta)
+    quiet = jnp.log(QUIET_COST / (1 - QUIET_COST)) - jnp.median(logits, axis=1)
+    return theta.at[:, -1].set(quiet)
+
+
+def truncation_es(
+    config: SearchConfig, start: Callable[[Key], jax.Array] | None = None
+) -> ES:
     """The paper's search over theta [41]: keep the best, mutate, repeat.
 
     `config.selection` "random" replaces the ranking by a random choice of elites, the
     control that shows what selection adds.
+
+    Args:
+      config: the search.
+      start: key -> first candidates [P, 41]; default: N(0, `config.init_std`^2).
     """
     size, elites = config.population_size, config.num_elites
     capacity = config.num_stages * size
@@ -180,8 +234,11 @@ def truncation_es(config: SearchConfig) -> ES:
 
     def ask(key: Key, state: ESState) -> jax.Array:
         key_init, key_mutate = jax.random.split(key)
-        shape = (size, THETA_SIZE)
-        first = config.init_std * jax.random.normal(key_init, shape, jnp.float32)
+        if start is None:
+            shape = (size, THETA_SIZE)
+            first = config.init_std * jax.random.normal(key_init, shape, jnp.float32)
+        else:
+            first = start(key_init)
         children = mutate(
             key_mutate,
             state.elites,
@@ -195,7 +252,13 @@ def truncation_es(config: SearchConfig) -> ES:
 
     def tell(key: Key, state: ESState, candidates: jax.Array, fitness: Fitness):
         if config.selection == "paper":
-            parents, _ = select(candidates, fitness, elites, config.zero_tolerance)
+            parents, _ = select(
+                candidates,
+                fitness,
+                elites,
+                config.zero_tolerance,
+                config.return_floor,
+            )
         else:
             parents = candidates[jax.random.permutation(key, size)[:elites]]
         start = state.generation * size
@@ -217,13 +280,19 @@ def truncation_es(config: SearchConfig) -> ES:
     return ES(init, ask, tell)
 
 
-def best(state: ESState, population_size: int, zero_tolerance: float = 0.0) -> Best:
+def best(
+    state: ESState,
+    population_size: int,
+    zero_tolerance: float = 0.0,
+    return_floor: float | None = None,
+) -> Best:
     """The final pick: of all zero-violation candidates the one of highest return.
 
-    Without any, that of lowest cost; `zero_violation` says which it is.
+    Without any, that of lowest cost; `zero_violation` says which it is. With a
+    `return_floor` both of those that reach it, if any does.
     """
     fitness = state.archive_fitness
-    index = rank(fitness, zero_tolerance)[0]
+    index = rank(fitness, zero_tolerance, return_floor)[0]
     return Best(
         candidate=jax.tree.map(lambda x: x[index], state.archive),
         cost=fitness.cost[index],

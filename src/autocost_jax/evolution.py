@@ -26,6 +26,7 @@ from autocost_jax.population import (
     make_population,
 )
 from autocost_jax.records import Key, Metrics, Slot
+from autocost_jax.rollout import typical_lidars
 from autocost_jax.train import Learner, final_episodes, init_learner, run_stage
 
 # What the fitness and the report are made of, kept for every epoch of a stage.
@@ -199,7 +200,7 @@ def stage_result(
         candidates=candidates,
         fitness=fitness,
         scores=last,
-        order=es_lib.rank(fitness, config.zero_tolerance),
+        order=es_lib.rank(fitness, config.zero_tolerance, config.return_floor),
         frozen=frozen,
     )
 
@@ -208,7 +209,7 @@ def stage_functions(
     config: SearchConfig, root: Key, bank: Sequence[CostTerm] = BANK
 ) -> StageFunctions:
     """The functions around the chunks of a search."""
-    strategy = truncation_es(config)
+    strategy = truncation_es(config, _start(config))
 
     def begin(state: ESState, stage: jax.Array | int):
         candidates = strategy.ask(stage_key(root, stage, ASK), state)
@@ -237,6 +238,21 @@ def stage_functions(
         return strategy.tell(key, state, candidates, result.fitness), result
 
     return StageFunctions(strategy.init, begin, slots, record, end)
+
+
+def _start(config: SearchConfig) -> Callable[[Key], jax.Array] | None:
+    """How the first candidates are drawn; None for the strategy's own way."""
+    if config.start == "normal":
+        return None
+    env = make_env(config.train.env)
+
+    def start(key: Key) -> jax.Array:
+        lidars = typical_lidars(env, jax.random.key(0))
+        return es_lib.monotone_start(
+            key, config.population_size, config.init_std, lidars
+        )
+
+    return start
 
 
 def search(
@@ -379,4 +395,6 @@ def _tracked(metrics: tuple[Metrics, ...]) -> Metrics:
 
 def best_of(config: SearchConfig, state: ESState) -> Any:
     """The search's final pick, `es.Best`."""
-    return es_lib.best(state, config.population_size, config.zero_tolerance)
+    return es_lib.best(
+        state, config.population_size, config.zero_tolerance, config.return_floor
+    )

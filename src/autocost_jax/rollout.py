@@ -20,6 +20,21 @@ def reset_worlds(env: Env, key: Key, num_worlds: int) -> EnvState:
     return jax.vmap(env.reset)(jax.random.split(key, num_worlds))
 
 
+def typical_lidars(env: Env, key: Key, num_places: int = 1024) -> jax.Array:
+    """Constraint lidars [M, 8] at uniform places of fresh layouts; key is consumed."""
+    key_layout, key_place = jax.random.split(key)
+    keys = jax.random.split(key_layout, num_places)
+    low_x, low_y, high_x, high_y = env.config.placements_extents
+
+    def look(key: Key, place: jax.Array) -> jax.Array:
+        layout = env.reset(key).layout.replace(robot_xy=place)
+        return env.reset_to(layout, key).cost_inputs.constraint_lidar
+
+    low, high = jnp.array([low_x, low_y]), jnp.array([high_x, high_y])
+    places = jax.random.uniform(key_place, (num_places, 2), minval=low, maxval=high)
+    return jax.vmap(look)(keys, places)
+
+
 def unroll(
     env: Env,
     policy: Callable[[jax.Array, Key], jax.Array],
