@@ -19,7 +19,7 @@ from autocost_jax.config import THETA_SIZE, SearchConfig
 from autocost_jax.costs import HIDDEN, intrinsic_logit
 from autocost_jax.records import Key
 
-QUIET_COST = 0.01  # of a `monotone_start` at a typical place
+QUIET_COST = 1e-4  # of a `monotone_start` at a typical place
 
 
 class Fitness(struct.PyTreeNode):
@@ -182,8 +182,8 @@ def monotone_start(key: Key, num: int, std: float, lidars: jax.Array) -> jax.Arr
 
     Weights are |N(0, std^2)|, hidden units turn on around the mean lidar (their biases
     are N(0, std^2) from there), and the output bias makes the median cost over `lidars`
-    0.01. Of such networks about half are quiet far from hazards and loud near them, of
-    normal ones of the same std 6 in 1000 (default worlds, std 5).
+    1e-4: with a limit of 0 CPO ignores the reward as long as what a cost asks for
+    everywhere adds up to more than it can take back in one step.
 
     Args:
       key: consumed.
