@@ -1,5 +1,6 @@
-"""One search in two processes on this machine: the same run, and a clear end."""
+"""One run in two processes on this machine: the same numbers, and a clear end."""
 
+import json
 import os
 import signal
 import socket
@@ -16,6 +17,8 @@ from autocost_jax.store import read_metrics
 
 FLAGS = ["--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "4"]
 WAIT = 400  # seconds until a process counts as hung
+SEARCH = ["autocost_jax.evolve"]
+TABLE = ["autocost_jax.cli", "train"]
 NUMBERS = ("theta", "cost", "ep_return", "order", "elites", "archive")
 
 
@@ -32,8 +35,15 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
-def start(out: Path, environment, *flags: str, index: int | None = None, port: int = 0):
-    words = [sys.executable, "-m", "autocost_jax.evolve", "--out", str(out), *flags]
+def start(
+    out: Path,
+    environment,
+    *flags: str,
+    index: int | None = None,
+    port: int = 0,
+    command: list[str] = SEARCH,
+):
+    words = [sys.executable, "-m", *command, "--out", str(out), *flags]
     if index is not None:
         words += ["--coordinator", f"127.0.0.1:{port}"]
         words += ["--num-processes", "2", "--process-id", str(index)]
@@ -50,10 +60,11 @@ def start(out: Path, environment, *flags: str, index: int | None = None, port: i
     return process
 
 
-def start_both(out: Path, environment, *flags: str):
+def start_both(out: Path, environment, *flags: str, command: list[str] = SEARCH):
     port = free_port()
     return [
-        start(out, environment, *flags, index=index, port=port) for index in range(2)
+        start(out, environment, *flags, index=index, port=port, command=command)
+        for index in range(2)
     ]
 
 
@@ -111,6 +122,32 @@ def test_a_crash_ends_the_others_and_one_process_can_go_on(environment, tmp_path
     assert resumed.returncode == 0, said
     assert "resuming" in said
     assert [row["step"] for row in read_metrics(out)] == list(range(120))
+
+
+def test_a_table_in_two_processes_is_that_of_one(environment, tmp_path):
+    """`autocost train`: same metrics and scores, written once, and resumable."""
+    flags = ["--preset", "smoke", "--physics", "closed_form", "--num-seeds", "2"]
+    flags += ["--algorithms", "ppo", "cpo", "--episodes", "4"]
+    both = start_both(tmp_path / "both", environment, *flags, command=TABLE)
+    said = [process.communicate(timeout=WAIT)[0] for process in both]
+    assert [process.returncode for process in both] == [0, 0], said
+    alone = start(tmp_path / "one", environment, *flags, command=TABLE)
+    assert alone.wait(WAIT) == 0
+    scores = [
+        json.loads((tmp_path / name / "evaluation.json").read_text())["rows"]
+        for name in ("both", "one")
+    ]
+    assert len(scores[0]) == 4
+    for two, one in zip(*scores, strict=True):
+        assert two["method"] == one["method"]
+        assert two["return_mean"] == pytest.approx(one["return_mean"], abs=1e-3)
+    assert len(read_metrics(tmp_path / "both")) == 2
+    again = start_both(
+        tmp_path / "both", environment, "--resume", "--episodes", "4", command=TABLE
+    )
+    said = [process.communicate(timeout=WAIT)[0] for process in again]
+    assert [process.returncode for process in again] == [0, 0], said
+    assert "resuming" in said[0]
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,10 @@ def _train(argv: list[str]) -> None:
           resume: continue the run in `out` with its own settings.
           overwrite: start over in a directory that already holds a run.
           devices: devices to use; default: all; a CPU counts one a core.
+          coordinator: of a run in several processes, HOST:PORT of the first one, or
+            auto under SLURM and the like; start the command once for each of them.
+          num_processes: of such a run; leave out with auto.
+          process_id: of this one, from 0; leave out with auto.
           compile_cache: keep compiled programs in the user's cache directory.
           episodes: fresh episodes a policy is scored in.
           train: worlds, epochs and the learners' settings.
@@ -89,6 +93,9 @@ def _train(argv: list[str]) -> None:
         resume: bool = False
         overwrite: bool = False
         devices: int | None = None
+        coordinator: str | None = None
+        num_processes: int | None = None
+        process_id: int | None = None
         compile_cache: bool = True
         episodes: int = 100
         train: Annotated[TrainConfig, tyro.conf.OmitArgPrefixes] = field(
@@ -99,7 +106,9 @@ def _train(argv: list[str]) -> None:
     default = Options(train=with_env(train, argv))
     options = parse(Options, argv, "autocost train", default=default)
     use_compile_cache(options.compile_cache)
-    devices = use_devices(options.devices)  # before anything of JAX runs
+    # Before anything of JAX runs:
+    group = (options.coordinator, options.num_processes, options.process_id)
+    devices = use_devices(options.devices, *group)
     from autocost_jax.methods import Method, TableConfig, run_table
     from autocost_jax.store import read_config
 

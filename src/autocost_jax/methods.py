@@ -5,7 +5,6 @@ The run directory holds the configuration, metrics, checkpoints, the policy of e
 slot and their scores over fresh episodes.
 """
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from autocost_jax import cluster
 from autocost_jax.arrays import flatten
 from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import training_cost
@@ -37,7 +37,14 @@ from autocost_jax.population import (
 )
 from autocost_jax.progress import Display, format_seconds
 from autocost_jax.records import Slot
-from autocost_jax.store import RunDir, check_free_space, estimate_bytes
+from autocost_jax.run import output, resumed, useful_devices
+from autocost_jax.store import (
+    RunDir,
+    SilentRun,
+    check_free_space,
+    estimate_bytes,
+    open_run,
+)
 from autocost_jax.train import Learner
 
 Learners = Literal["ppo", "ppo_lagrangian", "cpo"]
@@ -164,7 +171,8 @@ def run_table(
       num_episodes: fresh episodes a slot in the final evaluation.
 
     Returns:
-      For each slot its method, seed and scores, as in evaluation.json.
+      For each slot its method, seed and scores, as in evaluation.json; of several
+      processes only the first has them, the others return an empty list.
 
     Raises:
       RunDirError: the directory is not usable for this run.
@@ -173,15 +181,12 @@ def run_table(
     require_episodes(num_episodes)
     slots = table_slots(config)
     largest = max(group.key.shape[0] for group in slots)
-    devices = list(devices or jax.devices()[:1])[:largest]
+    devices = useful_devices(devices, largest, "slots of an algorithm")
     env = make_env(config.train.env)
     agents = make_agents(config.algorithms, config.train, env)
     population = make_population(env, agents, config.train, devices=devices)
-    if resume:
-        run = RunDir.open(path, config)
-    else:
-        run = RunDir.create(path, config, overwrite=overwrite)
-    with run, Display(config.env_steps, 0, sys.stdout) as display:
+    run = open_run(path, config, resume=resume, overwrite=overwrite)
+    with run, Display(config.env_steps, 0, output()) as display:
         for line in run.warnings:
             display.say(line)
         display.say(
@@ -190,20 +195,24 @@ def run_table(
         )
         learners = population.init(slots)
         state = TableState(learners=learners, epoch=jnp.zeros((), jnp.int32))
-        check_free_space(run.path, 4 * estimate_bytes(state))
-        checkpoint = run.resume(state) if resume else None
-        if checkpoint is not None:
-            state = checkpoint.tree
-            for line in checkpoint.warnings:
-                display.say(line)
+        if cluster.is_first():
+            check_free_space(run.path, 4 * estimate_bytes(state))
+        found = resumed(run, state, display)[0] if resume else None
+        if found is not None:
+            state = found
             display.say(f"resuming {path} after {int(state.epoch)} epochs")
         run.start_tensorboard(purge_step=int(state.epoch) or None)
         state = _train(run, config, population, slots, state, display)
-        return _finish(run, config, state, display, num_episodes)
+        state = state.replace(learners=population.fetch(state.learners))
+        table = []
+        if isinstance(run, RunDir):
+            table = _finish(run, config, state, display, num_episodes)
+        cluster.wait_for_all()
+        return table
 
 
 def _train(
-    run: RunDir,
+    run: RunDir | SilentRun,
     config: TableConfig,
     population: Population,
     slots: tuple[Slot, ...],
@@ -215,13 +224,14 @@ def _train(
     for epoch in range(first, total, chunk):
         learners, metrics = population.chunk(state.learners, slots, epoch)
         state = TableState(learners, jnp.asarray(epoch + chunk, jnp.int32))
-        metrics = jax.tree.map(np.asarray, metrics)
+        metrics = jax.tree.map(np.asarray, population.fetch(metrics))
         for k in range(chunk):
             row: dict[str, Any] = {"epoch": epoch + k}
             for name, group in zip(config.algorithms, metrics, strict=True):
                 row |= {f"{name}/{key}": value[k] for key, value in group.items()}
             run.log_metrics(row, epoch + k)
-        run.save_checkpoint(state, epoch + chunk)
+        saved = state.replace(learners=population.fetch(state.learners))
+        run.save_checkpoint(saved, epoch + chunk)
         left = (time.monotonic() - start) / (epoch + chunk - first)
         named = zip(config.algorithms, metrics, strict=True)
         display.say(

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import jax
 import numpy as np
@@ -42,6 +42,7 @@ from autocost_jax.store import (
     SilentRun,
     check_free_space,
     estimate_bytes,
+    open_run,
 )
 from autocost_jax.train import slots_at_once
 
@@ -150,24 +151,11 @@ def run_search(
       RuntimeError: every candidate of a stage failed.
     """
     require_episodes(num_episodes)
-    # A device without a candidate of its own would only train copies.
-    devices = list(devices or jax.devices()[:1])[: config.population_size]
-    if len({device.process_index for device in devices}) < jax.process_count():
-        raise ValueError(
-            f"{jax.process_count()} processes are more than the "
-            f"{config.population_size} candidates can be dealt to"
-        )
+    devices = useful_devices(devices, config.population_size, "candidates")
     check_memory(config, devices)
     searcher = make_searcher(config, devices)
-    if not cluster.is_first():
-        run = SilentRun(path, config)
-    elif resume:
-        run = RunDir.open(path, config)
-    else:
-        run = RunDir.create(path, config, overwrite=overwrite)
-    total = config.env_steps
-    stream = sys.stdout if cluster.is_first() else io.StringIO()
-    with run, Display(total, 0, stream) as display:
+    run = open_run(path, config, resume=resume, overwrite=overwrite)
+    with run, Display(config.env_steps, 0, output()) as display:
         for line in [*run.warnings, *describe(config, len(devices))]:
             display.say(line)
         state = _start(run, searcher, display, resume)
@@ -180,6 +168,49 @@ def run_search(
         return path / "report" / "index.html"
 
 
+def useful_devices(
+    devices: Sequence[Any] | None, num_slots: int, what: str
+) -> list[Any]:
+    """Devices that have a slot of their own; more would only train copies.
+
+    Args:
+      devices: those that may be used; default: the first one.
+      num_slots: of the largest group.
+      what: the slots are called in an error.
+
+    Raises:
+      ValueError: if some process would be without a slot.
+    """
+    chosen = list(devices or jax.devices()[:1])[:num_slots]
+    if len({device.process_index for device in chosen}) < jax.process_count():
+        raise ValueError(
+            f"{jax.process_count()} processes are more than the {num_slots} {what} "
+            "can be dealt to"
+        )
+    return chosen
+
+
+def output() -> TextIO:
+    """Where this process prints: of several only the first does."""
+    return sys.stdout if cluster.is_first() else io.StringIO()
+
+
+def resumed(
+    run: RunDir | SilentRun, template: Any, display: Display
+) -> tuple[Any, int | None]:
+    """The state of the newest checkpoint, in every process, and its step.
+
+    None, None where there is none yet; the step is known to the first process alone.
+    """
+    checkpoint = run.resume(template)
+    found = cluster.share(checkpoint and checkpoint.tree, template)
+    if found is None:
+        display.say(f"{run.path} has no checkpoint yet: starting again")
+    for line in checkpoint.warnings if checkpoint else ():
+        display.say(line)
+    return found, checkpoint.step if checkpoint else None
+
+
 def _start(
     run: RunDir | SilentRun, searcher: Searcher, display: Display, resume: bool
 ) -> SearchState:
@@ -188,15 +219,9 @@ def _start(
         check_free_space(run.path, 4 * estimate_bytes(state))
     step = None
     if resume:
-        checkpoint = run.resume(state)
-        found = cluster.share(checkpoint and checkpoint.tree, state)
-        if found is None:
-            display.say(f"{run.path} has no checkpoint yet: starting again")
-        else:
+        found, step = resumed(run, state, display)
+        if found is not None:
             state = found
-            step = checkpoint.step if checkpoint else None
-            for line in checkpoint.warnings if checkpoint else ():
-                display.say(line)
             done = f"{int(state.stage)} stages and {int(state.epoch)} epochs"
             display.say(f"resuming {run.path} after {done}")
             display.skip(_steps_done(run.config, state))

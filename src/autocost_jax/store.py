@@ -24,7 +24,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from autocost_jax import checkpoints
+from autocost_jax import checkpoints, cluster
 from autocost_jax.arrays import (
     TEMPORARY,
     ArraySpec,
@@ -70,6 +70,7 @@ __all__ = [
     "from_dict",
     "list_stages",
     "load_arrays",
+    "open_run",
     "read_config",
     "read_metrics",
     "run_facts",
@@ -378,6 +379,21 @@ class SilentRun:
 
     def write_policy(self, name: str, params: Any) -> None:
         """Nothing is written."""
+
+
+def open_run(
+    path: Path, config: Any, *, resume: bool, overwrite: bool
+) -> RunDir | SilentRun:
+    """The run directory of a new or resumed run; of several processes the first's.
+
+    Raises:
+      RunDirError: see `RunDir.create` and `RunDir.open`.
+    """
+    if not cluster.is_first():
+        return SilentRun(path, config)
+    if resume:
+        return RunDir.open(path, config)
+    return RunDir.create(path, config, overwrite=overwrite)
 
 
 def _run_files(path: Path) -> list[Path]:

@@ -1,0 +1,404 @@
+"""What the figures of the paper share: cost designs, training, statistics, pictures.
+
+A *design* is a training cost and its limit. It is trained once for each world, by
+PPO-Lagrangian and CPO with every seed side by side (one table of slots), and serves
+all figures that show it. A figure is a list of designs and worlds: `Figure`, `main`.
+
+    python experiments/cost_limits.py run       # train what is not trained yet
+    python experiments/cost_limits.py collect   # JSON, table, picture of what has run
+
+`--scale reduced` (default) fits a CPU and is no result of the paper's scale, which is
+`--scale paper`; `--smoke` shrinks everything to a minute. Runs can be stopped and
+started again.
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from common import compact, run_if_needed
+
+from autocost_jax import TrainConfig, env_config, load_cost, preset
+from autocost_jax.commandline import use_compile_cache, use_devices
+from autocost_jax.methods import Learners, Method, TableConfig
+from autocost_jax.rundata import to_json
+from autocost_jax.store import read_config, read_metrics, run_facts
+
+RESULTS = Path("experiments/results")
+TRAINING_WORLD = "Goal-Hazard-Point"
+BOTH: tuple[Learners, ...] = ("ppo_lagrangian", "cpo")
+NAMES = {"ppo": "PPO", "ppo_lagrangian": "PPO-Lag", "cpo": "CPO"}
+CURVES = ("ep_return", "ep_cost", "ep_total_cost")
+
+
+class Design(NamedTuple):
+    """A training cost.
+
+    Attributes:
+      title: in legends and tables.
+      cost: terms of the cost bank.
+      limit: allowed cost of an episode.
+      theta: file of the intrinsic network's parameters, if `cost` uses it.
+      algorithms: that are trained with it.
+    """
+
+    title: str
+    cost: str = "extrinsic"
+    limit: float = 0.0
+    theta: Path | str | None = None
+    algorithms: tuple[Learners, ...] = BOTH
+
+
+COSTS = RESULTS / "reduced" / "costs"
+WITH_NETWORK = "extrinsic+intrinsic"
+DESIGNS: dict[str, Design] = {
+    "unconstrained": Design("", algorithms=("ppo",)),
+    "extrinsic": Design("limit 0"),
+    "limit_0.5": Design("limit 0.5", limit=0.5),
+    "limit_-0.1": Design("limit -0.1", limit=-0.1),
+    "limit_-1": Design("limit -1", limit=-1.0),
+    "distance_decrease": Design("distance decrease", "distance_decrease"),
+    "distance_change": Design("distance change", "distance_change"),
+    "distance_change_indicator": Design("its indicator", "distance_change_indicator"),
+    "margin_2x": Design("margin 2x", "safety_margin_2x"),
+    "margin_3x": Design("margin 3x", "safety_margin_3x"),
+    "steep": Design("steep network", WITH_NETWORK, theta=COSTS / "steep"),
+    "evolved": Design("evolved", WITH_NETWORK, theta="ic4srl"),
+    "evolved_alone": Design("evolved, w/o extrinsic", "intrinsic", theta="ic4srl"),
+}
+
+
+class Scale(NamedTuple):
+    """How much of everything.
+
+    Attributes:
+      train: sizes and the learners' settings, in any world.
+      seeds: one slot each.
+      episodes: fresh ones a policy is scored in.
+      sizes: worlds a slot and epochs of slow worlds.
+    """
+
+    train: TrainConfig
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    episodes: int = 200
+    sizes: dict[str, tuple[int, int]] = {}  # noqa: RUF012
+
+
+def scales() -> dict[str, Scale]:
+    """`reduced`: the laptop's update and 512,000 steps a slot, fewer in slow worlds."""
+    laptop, smoke = preset("laptop").train, preset("smoke").train
+    slow = {
+        "Goal-Pillar-Point": (4, 64),
+        "Push-Hazard-Point": (4, 64),
+        "Push-Pillar-Point": (4, 64),
+        "Goal-Hazard-Car": (4, 64),
+        "Goal-Hazard-Doggo": (4, 64),
+    }
+    reduced = dataclasses.replace(laptop, num_epochs=64, chunk_epochs=4)
+    return {
+        "reduced": Scale(reduced, sizes=slow),
+        "paper": Scale(preset("paper").train),
+        "smoke": Scale(smoke, seeds=(0, 1), episodes=2),
+    }
+
+
+class Figure(NamedTuple):
+    """A figure of the paper.
+
+    Attributes:
+      name: of its files.
+      title: what it shows.
+      paper: what the paper reports.
+      designs: keys of `DESIGNS`.
+      worlds: a column each.
+      curves: a row each, keys of `CURVES`.
+    """
+
+    name: str
+    title: str
+    paper: str
+    designs: tuple[str, ...]
+    worlds: tuple[str, ...] = (TRAINING_WORLD,)
+    curves: tuple[str, ...] = ("ep_return", "ep_cost")
+
+
+def table(world: str, design: str, scale: Scale) -> TableConfig:
+    """What is trained for one design in one world."""
+    cost = DESIGNS[design]
+    theta = None if cost.theta is None else tuple(load_cost(cost.theta).tolist())
+    env = env_config(world)
+    if world == TRAINING_WORLD:  # equal to MJX to rounding, and faster
+        env = dataclasses.replace(env, physics="closed_form")
+    train, steps = scale.train, scale.train.env.num_steps
+    worlds, epochs = scale.sizes.get(world, (train.num_worlds, train.num_epochs))
+    train = dataclasses.replace(
+        train,
+        env=dataclasses.replace(env, num_steps=steps),
+        num_worlds=worlds,
+        num_epochs=epochs,
+    )
+    methods = tuple(
+        Method(name, name, cost.cost, cost.limit, theta) for name in cost.algorithms
+    )
+    return TableConfig(train, methods, scale.seeds)
+
+
+def run_dir(runs: Path, world: str, design: str) -> Path:
+    """Where a design's training in a world is kept, for all figures."""
+    return runs / world / design
+
+
+def run(figure: Figure, scale: Scale, runs: Path) -> None:
+    """Train the figure's designs, but for what another figure has trained already."""
+    for world in figure.worlds:
+        for design in figure.designs:
+            config = table(world, design, scale)
+            run_if_needed(config, run_dir(runs, world, design), scale.episodes)
+
+
+def scores(path: Path) -> dict[str, Any]:
+    """Of one trained design: for each algorithm its scores, and its curves."""
+    config = read_config(path, TableConfig)[0]
+    rows = json.loads((path / "evaluation.json").read_text())["rows"]
+    metrics = read_metrics(path)
+    result: dict[str, Any] = {}
+    for group in config.algorithms:
+        slots = config.group(group)
+        for method in dict.fromkeys(method.label for method, _ in slots):
+            own = [i for i, (slot, _) in enumerate(slots) if slot.label == method]
+            result[method] = summarise([r for r in rows if r["method"] == method])
+            result[method]["curves"] = {
+                name: curve([np.take(row[f"{group}/{name}"], own) for row in metrics])
+                for name in CURVES
+            }
+    train = config.train
+    steps = train.num_worlds * train.env.num_steps * train.num_epochs
+    return {"steps_a_slot": steps, "algorithms": result}
+
+
+def curve(values: Sequence[np.ndarray]) -> dict[str, list[float]]:
+    """Mean, lowest and highest seed of each epoch; values [T][seeds]."""
+    array = np.asarray(values)
+    return {
+        "mean": array.mean(1).round(3).tolist(),
+        "low": array.min(1).round(3).tolist(),
+        "high": array.max(1).round(3).tolist(),
+    }
+
+
+def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Scores over seeds with bootstrap intervals, and the pooled rate of violations."""
+    episodes = sum(row["episodes"] for row in rows)
+    violations = sum(round(row["violation_rate"] * row["episodes"]) for row in rows)
+    return {
+        "return": bootstrap([row["return_mean"] for row in rows]),
+        "cost": bootstrap([row["cost_mean"] for row in rows]),
+        "distance_travelled": float(
+            np.mean([row["distance_travelled"] for row in rows])
+        ),
+        "frozen": sum(row["frozen_epoch"] >= 0 for row in rows),
+        "episodes": episodes,
+        "violations": violations,
+        "violation_rate": violations / episodes,
+        "violation_rate_upper": upper_bound(violations, episodes),
+    }
+
+
+def bootstrap(values: Sequence[float], draws: int = 10_000) -> dict[str, Any]:
+    """Mean of one value a seed, with the 95 % interval of the resampled mean."""
+    array = np.asarray(values, np.float64)
+    rng = np.random.default_rng(0)
+    means = rng.choice(array, (draws, array.size)).mean(1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return {
+        "seeds": array.round(4).tolist(),
+        "mean": float(array.mean()),
+        "low": float(low),
+        "high": float(high),
+    }
+
+
+def upper_bound(violations: int, episodes: int) -> float:
+    """One-sided 95 % Clopper-Pearson bound of a rate; zero of N gives about 3 / N.
+
+    It takes episodes as independent: those of one policy share its faults, so that it
+    speaks of these policies, not of training.
+    """
+    from scipy.stats import beta
+
+    if violations >= episodes:
+        return 1.0
+    return float(beta.ppf(0.95, violations + 1, episodes - violations))
+
+
+def collect(figure: Figure, scale_name: str, runs: Path, results: Path) -> None:
+    """Write the JSON, the table and the picture of whatever has been run."""
+    scale = scales()[scale_name]
+    panels = {
+        world: {
+            design: scores(run_dir(runs, world, design))
+            for design in figure.designs
+            if (run_dir(runs, world, design) / "evaluation.json").exists()
+        }
+        for world in figure.worlds
+    }
+    facts = run_facts()
+    facts.pop("seed")
+    result = {
+        "title": figure.title,
+        "paper": figure.paper,
+        "scale": scale_name,
+        "command": f"python experiments/{figure.name}.py run --scale {scale_name}",
+        "seeds": list(scale.seeds),
+        "facts": facts,
+        "worlds": {world: panel for world, panel in panels.items() if panel},
+    }
+    result = json.loads(json.dumps(to_json(result), allow_nan=False))
+    file = write(result, figure.name, results)
+    file.with_suffix(".md").write_text(render(result))
+    draw(figure, result, file.with_suffix(".png"))
+    print(file)
+
+
+def write(result: dict[str, Any], name: str, results: Path) -> Path:
+    """`results`/NAME.json."""
+    results.mkdir(parents=True, exist_ok=True)
+    file = results / f"{name}.json"
+    file.write_text(compact(to_json(result)) + "\n")
+    return file
+
+
+def label(design: str, algorithm: str) -> str:
+    """As in the paper's legends: CPO, limit 0."""
+    title = DESIGNS[design].title
+    return NAMES[algorithm] + (f", {title}" if title else "")
+
+
+def caption(result: dict[str, Any], world: str) -> str:
+    """How much the numbers of a world rest on."""
+    panel = result["worlds"][world]
+    steps = {design["steps_a_slot"] for design in panel.values()}
+    episodes = {a["episodes"] for d in panel.values() for a in d["algorithms"].values()}
+    seeds = len(result["seeds"])
+    return (
+        f"{result['scale']} scale: {max(steps):,} steps a slot, {seeds} seeds, "
+        f"{max(episodes)} fresh episodes a method"
+    )
+
+
+def render(result: dict[str, Any]) -> str:
+    """A table for each world."""
+    parts = []
+    for world, panel in result["worlds"].items():
+        lines = [
+            f"{world} ({caption(result, world)})",
+            "",
+            "| method | return (95 %) | extrinsic cost (95 %) "
+            "| violating episodes | at most (95 %) |",
+            "|---|---|---|---|---|",
+        ]
+        for design, trained in panel.items():
+            for algorithm, row in trained["algorithms"].items():
+                cells = [label(design, algorithm)]
+                cells += [
+                    f"{row[key]['mean']:.{digits}f} "
+                    f"({row[key]['low']:.{digits}f} to {row[key]['high']:.{digits}f})"
+                    for key, digits in (("return", 1), ("cost", 2))
+                ]
+                cells.append(f"{row['violations']} of {row['episodes']}")
+                cells.append(f"{row['violation_rate_upper']:.1%}")
+                lines.append("| " + " | ".join(cells) + " |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+AXES = {
+    "ep_return": "return an episode",
+    "ep_cost": "extrinsic cost an episode",
+    "ep_total_cost": "training cost an episode",
+}
+
+
+def draw(figure: Figure, result: dict[str, Any], file: Path) -> None:
+    """Learning curves: a column a world, a row a curve; bands from seed to seed."""
+    from matplotlib.figure import Figure as Picture
+
+    worlds, rows = list(result["worlds"]), figure.curves
+    if not worlds:
+        return
+    size = (1.5 + 3.6 * len(worlds), 1.2 + 2.4 * len(rows))
+    picture = Picture(figsize=size, layout="constrained")
+    axes = picture.subplots(len(rows), len(worlds), squeeze=False)
+    for column, world in enumerate(worlds):
+        for design, trained in result["worlds"][world].items():
+            color = f"C{figure.designs.index(design)}"
+            for algorithm, row in trained["algorithms"].items():
+                style = {"cpo": "--", "ppo": ":"}.get(algorithm, "-")
+                for index, name in enumerate(rows):
+                    values = row["curves"][name]
+                    share = np.arange(1, 1 + len(values["mean"])) / len(values["mean"])
+                    steps = share * trained["steps_a_slot"]
+                    panel = axes[index, column]
+                    panel.plot(
+                        steps,
+                        smooth(values["mean"]),
+                        style,
+                        color=color,
+                        label=label(design, algorithm),
+                    )
+                    low, high = smooth(values["low"]), smooth(values["high"])
+                    panel.fill_between(steps, low, high, color=color, alpha=0.1)
+        axes[0, column].set_title(f"{world}\n{caption(result, world)}", fontsize=7)
+        axes[-1, column].set_xlabel("env steps a slot")
+    for index, name in enumerate(rows):
+        axes[index, 0].set_ylabel(AXES[name])
+        if name != "ep_return":
+            for panel in axes[index]:
+                panel.set_yscale("symlog", linthresh=0.1)
+                panel.axhline(0, color="r", linewidth=0.8)
+    axes[0, 0].legend(fontsize=6)
+    picture.suptitle(figure.title, fontsize=9)
+    picture.savefig(file, dpi=130)
+
+
+def smooth(values: Sequence[float], width: int = 5) -> np.ndarray:
+    """Means over the last epochs, as far as there are any."""
+    array = np.asarray(values, np.float64)
+    sums = np.cumsum(np.insert(array, 0, 0.0))
+    end = np.arange(1, len(array) + 1)
+    start = np.maximum(end - width, 0)
+    return (sums[end] - sums[start]) / (end - start)
+
+
+def arguments(description: str | None) -> argparse.Namespace:
+    """Flags of an experiment's script; devices and the compile cache are set up."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("part", choices=("run", "collect"))
+    parser.add_argument("--scale", choices=("reduced", "paper"), default="reduced")
+    parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--only", nargs="+", default=(), help="worlds")
+    parser.add_argument("--runs", type=Path, help="default: runs/figures/SCALE")
+    parser.add_argument("--results", type=Path)
+    args = parser.parse_args()
+    args.scale = "smoke" if args.smoke else args.scale
+    args.runs = args.runs or Path("runs/figures") / args.scale
+    where = args.runs / "results" if args.smoke else RESULTS / args.scale
+    args.results = args.results or where
+    use_compile_cache(True)
+    use_devices(None)  # a device a core, before anything of JAX runs
+    return args
+
+
+def main(figure: Figure, description: str | None) -> None:
+    """The command line of a figure."""
+    args = arguments(description)
+    if args.only:
+        figure = figure._replace(worlds=tuple(args.only))
+    if args.part == "run":
+        run(figure, scales()[args.scale], args.runs)
+    else:
+        collect(figure, args.scale, args.runs, args.results)
