@@ -13,7 +13,6 @@ from env_data import blank_layout, load, states_at
 from autocost_jax.env_config import EnvConfig, env_config
 from autocost_jax.envs.env import make_env
 from autocost_jax.envs.models import scene_model
-from autocost_jax.envs.solver import solve_positive
 
 mujoco: Any = untyped_mujoco  # its compiled names have no stubs
 
@@ -151,11 +150,3 @@ def test_box_is_pushed_as_recorded_until_shortly_after_contact():
     np.testing.assert_allclose(
         reward[: onset - 1], recorded["reward"][1:onset], atol=1e-5
     )
-
-
-def test_solve_positive_solves():
-    rng = np.random.default_rng(0)
-    factor = rng.normal(size=(19, 19))
-    matrix, vector = factor @ factor.T + np.eye(19), rng.normal(size=19)
-    got = solve_positive(jnp.asarray(matrix), jnp.asarray(vector))
-    np.testing.assert_allclose(got, np.linalg.solve(matrix, vector), rtol=2e-3)

@@ -8,19 +8,52 @@ with mass matrix M, unconstrained acceleration a, and for each row of a contact'
 pyramid or of a joint limit its Jacobian J_i, stiffness D_i and reference r_i. So is the
 method, Newton with an exact line search. `mjx.solver.solve` does the same; this one
 exists because that one factors every world's Hessian by a LAPACK call, which on a CPU
-hangs where two of them meet in JAX's thread pool, and because it is a few times faster.
+hangs where two of them meet in JAX's thread pool, and because it is many times faster.
+
+Worlds are lanes, the last axis of every array here, whatever was vmapped and in which
+order; sums over rows and degrees of freedom are then sums of vectors of worlds, which
+compilers make fast where a sum along the last axis stays scalar. A lane that has its
+solution stands still, so that its numbers do not depend on its neighbours.
 
 Source: MuJoCo documentation, Computation, "Primal problem"; engine_solver.c.
-Differs: a fixed number of iterations; no rows but inequalities, no elliptic cones.
+Differs: no rows but inequalities, no elliptic cones.
 """
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 from mujoco import mjx
 
 LINE_SEARCH_STEPS = 5
+ROWS = 8  # rows are filled up to a multiple, so that sums over them can be halved
+# Lanes that a CPU solves together: a few vectors of its, and their rows fit its cache.
+CPU_LANES = 32
+
+
+class Problem(NamedTuple):
+    """The minimisation in W worlds.
+
+    Attributes:
+      jacobian: [nv, n, W] J, columns first.
+      stiffness: [n, W] D.
+      reference: [n, W] r.
+      mass: [nv, nv, W] M.
+      smooth: [nv, W] a.
+      force: [nv, W] M a.
+      start: [nv, W] where to begin, if that is better than a.
+    """
+
+    jacobian: jax.Array
+    stiffness: jax.Array
+    reference: jax.Array
+    mass: jax.Array
+    smooth: jax.Array
+    force: jax.Array
+    start: jax.Array
 
 
 def solve_constraints(model: mjx.Model, data: mjx.Data, iterations: int) -> mjx.Data:
@@ -29,56 +62,167 @@ def solve_constraints(model: mjx.Model, data: mjx.Data, iterations: int) -> mjx.
     Args:
       model: pyramidal cones, no equalities, no friction loss.
       data: `mjx.fwd_acceleration` has been called.
-      iterations: Newton steps.
+      iterations: Newton steps at most.
 
     Returns:
       data with `qacc` [nv], `qfrc_constraint` [nv] and `_impl.efc_force` [nefc].
     """
     impl: Any = data._impl
-    jacobian, stiffness = impl.efc_J, impl.efc_D
-    mass = mjx.full_m(model, data)
-
-    def gap(x: jax.Array) -> jax.Array:
-        return _mul(jacobian, x) - impl.efc_aref
-
-    def cost(x: jax.Array) -> jax.Array:
-        away = x - data.qacc_smooth
-        short = jnp.minimum(0.0, gap(x))
-        return (_mul(mass, away) * away).sum() + (stiffness * short * short).sum()
-
-    def step(_, x: jax.Array) -> jax.Array:
-        distance = gap(x)
-        weight = jnp.where(distance < 0, stiffness, 0.0)
-        gradient = _mul(mass, x) - data.qfrc_smooth
-        gradient += _mul(jacobian.T, weight * distance)
-        hessian = mass + jnp.dot(jacobian.T * weight, jacobian, precision="highest")
-        direction = -solve_positive(hessian, gradient)
-        change = _mul(jacobian, direction)
-        slope = (gradient * direction).sum()
-        slope -= (weight * distance * change).sum()  # of the mass term alone
-        curvature = (_mul(mass, direction) * direction).sum()
-        length = _line_search(slope, curvature, stiffness, distance, change)
-        return x + length * direction
-
-    start = jnp.where(
-        cost(data.qacc_warmstart) < cost(data.qacc_smooth),
-        data.qacc_warmstart,
-        data.qacc_smooth,
+    count = impl.efc_D.shape[0]
+    spare = -count % ROWS
+    problem = Problem(
+        jacobian=jnp.pad(impl.efc_J.T, ((0, 0), (0, spare))),
+        stiffness=jnp.pad(impl.efc_D, (0, spare)),
+        reference=jnp.pad(impl.efc_aref, (0, spare)),
+        mass=mjx.full_m(model, data),
+        smooth=data.qacc_smooth,
+        force=data.qfrc_smooth,
+        start=data.qacc_warmstart,
     )
-    qacc = jax.lax.fori_loop(0, iterations, step, start)
-    force = -stiffness * jnp.minimum(0.0, gap(qacc))
+    lanes = jax.tree.map(lambda x: x[..., None], problem)
+    qacc, force, push = (x[..., 0] for x in _solver(iterations)(lanes))
     solved: Any = {
         "qacc": qacc,
-        "qfrc_constraint": _mul(jacobian.T, force),
-        "_impl.efc_force": force,
+        "qfrc_constraint": push,
+        "_impl.efc_force": force[:count],
     }
     result: Any = data.tree_replace(solved)
     return result
 
 
-def _mul(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """[n] matrix [n, m] times vector [m], elementwise: exact float32 everywhere."""
-    return (matrix * vector).sum(-1)
+@functools.cache
+def _solver(iterations: int) -> Callable[[Problem], tuple[jax.Array, ...]]:
+    """Problem [..., W] -> x [nv, W], the rows' forces [n, W] and their push [nv, W].
+
+    Under `vmap` the new axis joins the lanes.
+    """
+
+    @custom_vmap
+    def solve(problem: Problem) -> tuple[jax.Array, ...]:
+        return _in_blocks(functools.partial(minimise, iterations=iterations), problem)
+
+    @solve.def_vmap
+    def _(size: int, is_batched: Any, problem: Problem):
+        def join(x: jax.Array, is_batched: bool) -> jax.Array:
+            if not is_batched:
+                x = jnp.broadcast_to(x, (size, *x.shape))
+            x = jnp.moveaxis(x, 0, -2)
+            return x.reshape(*x.shape[:-2], -1)
+
+        def split(x: jax.Array) -> jax.Array:
+            return jnp.moveaxis(x.reshape(*x.shape[:-1], size, -1), -2, 0)
+
+        (batched,) = is_batched
+        solved = solve(jax.tree.map(join, problem, batched))
+        return jax.tree.map(split, solved), jax.tree.map(lambda _: True, solved)
+
+    return solve
+
+
+def _in_blocks(function: Callable[[Problem], Any], problem: Problem) -> Any:
+    """`function` of all lanes; on a CPU of `CPU_LANES` at a time."""
+    lanes = problem.start.shape[-1]
+    if jax.default_backend() != "cpu" or lanes <= CPU_LANES:
+        return function(problem)
+    blocks = -(-lanes // CPU_LANES)
+
+    def cut(x: jax.Array) -> jax.Array:
+        spare = [(0, 0)] * (x.ndim - 1) + [(0, blocks * CPU_LANES - lanes)]
+        x = jnp.pad(x, spare, mode="edge")
+        return jnp.moveaxis(x.reshape(*x.shape[:-1], blocks, CPU_LANES), -2, 0)
+
+    def join(x: jax.Array) -> jax.Array:
+        x = jnp.moveaxis(x, 0, -2)
+        return x.reshape(*x.shape[:-2], -1)[..., :lanes]
+
+    return jax.tree.map(join, jax.lax.map(function, jax.tree.map(cut, problem)))
+
+
+def minimise(problem: Problem, iterations: int) -> tuple[jax.Array, ...]:
+    """Newton's method in every lane, from the better of two starts.
+
+    A lane is done when a step leaves its set of pushing rows as it was: along such a
+    step the function is one quadratic, of which the step has reached the minimum.
+
+    Args:
+      problem: fields [..., W].
+      iterations: steps at most; a CPU ends when all lanes are done.
+
+    Returns:
+      x [nv, W], the rows' forces [n, W] and their push J' force [nv, W].
+    """
+    jacobian, stiffness, reference, mass, smooth, force, start = problem
+
+    def gap(x: jax.Array) -> jax.Array:
+        return _mul(jacobian, x) - reference
+
+    def cost(x: jax.Array) -> jax.Array:
+        away, short = x - smooth, jnp.minimum(0.0, gap(x))
+        return _sum(_mul(mass, away) * away) + _sum(stiffness * short * short)
+
+    def is_open(carry: tuple) -> jax.Array:
+        count, _, _, is_done = carry
+        return (count < iterations) & ~is_done.all()
+
+    def step(carry: tuple) -> tuple:
+        count, x, distance, is_done = carry
+        weight = jnp.where(distance < 0, stiffness, 0.0)
+        gradient = _mul(mass, x) - force + _push(jacobian, weight * distance)
+        direction = -solve_positive(mass + _gram(jacobian, weight), gradient)
+        change = _mul(jacobian, direction)
+        slope = _sum(gradient * direction)
+        slope -= _sum(weight * distance * change)  # of the mass term alone
+        curvature = _sum(_mul(mass, direction) * direction)
+        length = _line_search(slope, curvature, stiffness, distance, change)
+        moved = jnp.where(is_done, x, x + length * direction)
+        reached = gap(moved)
+        is_same = ((reached < 0) == (distance < 0)).all(0)
+        return count + 1, moved, reached, is_done | is_same
+
+    x = jnp.where(cost(start) < cost(smooth), start, smooth)
+    carry = (jnp.zeros((), jnp.int32), x, gap(x), jnp.zeros(x.shape[-1:], bool))
+    if jax.default_backend() == "cpu":
+        _, x, distance, _ = jax.lax.while_loop(is_open, step, carry)
+    else:  # asking the device each time would take longer than the steps
+        carry = jax.lax.fori_loop(0, iterations, lambda _, carry: step(carry), carry)
+        _, x, distance, _ = carry
+    forces = -stiffness * jnp.minimum(0.0, distance)
+    return x, forces, _push(jacobian, forces)
+
+
+def _sum(x: jax.Array, axis: int = 0) -> jax.Array:
+    """Sum along an axis that is not the last: halves are added, vector by vector."""
+    size = x.shape[axis]
+    while size % 2 == 0:
+        size //= 2
+        low = jax.lax.slice_in_dim(x, 0, size, axis=axis)
+        x = low + jax.lax.slice_in_dim(x, size, 2 * size, axis=axis)
+    parts = [jax.lax.index_in_dim(x, i, axis, keepdims=False) for i in range(size)]
+    return functools.reduce(jnp.add, parts)
+
+
+def _mul(columns: jax.Array, x: jax.Array) -> jax.Array:
+    """[m, W] matrix times vector: columns [n, m, W], x [n, W]; exact float32."""
+    return functools.reduce(jnp.add, [a * b for a, b in zip(columns, x, strict=True)])
+
+
+def _push(jacobian: jax.Array, force: jax.Array) -> jax.Array:
+    """[nv, W] J' force."""
+    return _sum(jacobian * force, 1)
+
+
+def _gram(jacobian: jax.Array, weight: jax.Array) -> jax.Array:
+    """[nv, nv, W] J' diag(weight) J; the lower half is computed and mirrored."""
+    size = len(jacobian)
+    weighted = jacobian * weight
+    rows = [
+        jnp.pad(_sum(weighted[: i + 1] * jacobian[i], 1), ((0, size - i - 1), (0, 0)))
+        for i in range(size)
+    ]
+    lower = jnp.stack(rows)
+    index = jnp.arange(size)
+    is_lower = (index <= index[:, None])[..., None]
+    return jnp.where(is_lower, lower, jnp.swapaxes(lower, 0, 1))
 
 
 def _line_search(
@@ -95,15 +239,24 @@ def _line_search(
     Newton's method on f', which is piecewise linear and increases; the bracket found so
     far takes the middle where a step would leave it.
 
+    Args:
+      slope: [W].
+      curvature: [W].
+      stiffness: [n, W].
+      distance: [n, W].
+      change: [n, W].
+
     Returns:
-      t [], at least 0.
+      t [W], at least 0.
     """
+    pull = stiffness * change
+    bend = pull * change
 
     def body(_, carry):
         t, low, high = carry
         short = jnp.minimum(0.0, distance + t * change)
-        first = slope + curvature * t + (stiffness * change * short).sum()
-        bent = jnp.where(short < 0, stiffness * change * change, 0.0).sum()
+        first = slope + curvature * t + _sum(pull * short)
+        bent = _sum(jnp.where(short < 0, bend, 0.0))
         low, high = jnp.where(first < 0, t, low), jnp.where(first < 0, high, t)
         newton = t - first / (curvature + bent)
         middle = jnp.where(jnp.isinf(high), 2 * t, (low + high) / 2)
@@ -117,12 +270,12 @@ def _line_search(
 
 
 def solve_positive(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """The solution x [n] of matrix [n, n] x = vector [n], matrix positive definite.
+    """The solution x [n, W] of matrix [n, n, W] x = vector [n, W], positive definite.
 
-    Gauss-Jordan elimination, which needs no pivoting here: plain arithmetic that `vmap`
-    turns into long vectors, where a library call would be made for each small system.
+    Gauss-Jordan elimination, which needs no pivoting here: plain arithmetic on vectors
+    of worlds, where a library call would be made for each small system.
     """
-    index = jnp.arange(len(vector))
+    index = jnp.arange(len(vector))[:, None]
 
     def eliminate(j: jax.Array, rows: jax.Array) -> jax.Array:
         pivot = rows[j] / rows[j, j]
