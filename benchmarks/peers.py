@@ -6,7 +6,8 @@
 Each peer gets a virtual environment of its own under benchmarks/.venv/, made at the
 first call from PyPI; Safety-Gymnasium and omnisafe need a python3.10 on the path,
 mjx-safety-gym and crax-bench a python3.11. A peer that cannot be installed or run gets
-a row that says why. Writes benchmarks/results/peers.json and the table of it.
+a row that says why. Writes benchmarks/results/peers.json and the table of it; `--only`
+renews the rows of some peers.
 """
 
 import argparse
@@ -191,6 +192,11 @@ def render(result: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def key(row: dict[str, Any]) -> str:
+    """Which case a row is of."""
+    return json.dumps([row[name] for name in Case._fields])
+
+
 def main() -> None:
     """Measure, print rows, write JSON and table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -198,7 +204,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=HERE / "results", help="folder")
     options = parser.parse_args()
     devices = use_devices(None)
-    rows = []
+    file = options.out / "peers.json"
+    old = json.loads(file.read_text())["rows"] if file.exists() else []
+    rows = {key(row): row for row in old}
+    facts = run_facts()
+    facts.pop("seed")
+    stamp = {
+        "command": " ".join(["python benchmarks/peers.py", *sys.argv[1:]]),
+        "facts": facts,
+        "devices": len(devices),
+    }
     for case in (case for case in CASES if case.peer in options.only):
         theirs, why = None, None
         try:
@@ -206,17 +221,12 @@ def main() -> None:
         except PeerError as error:
             why = str(error)
         rate = measure_ours(case, devices).env_steps_per_second
-        rows.append({**case._asdict(), "peer_rate": theirs, "why": why, "rate": rate})
-        print(json.dumps(rows[-1]), flush=True)
-    facts = run_facts()
-    facts.pop("seed")
-    result = {
-        "command": " ".join(["python benchmarks/peers.py", *sys.argv[1:]]),
-        "facts": facts,
-        "devices": len(devices),
-        "rows": rows,
-    }
-    file = options.out / "peers.json"
+        row = {**case._asdict(), "peer_rate": theirs, "why": why, "rate": rate}
+        print(json.dumps(row), flush=True)
+        row = json.loads(json.dumps(row | stamp))
+        rows[key(row)] = row
+    order = [key(json.loads(json.dumps(case._asdict()))) for case in CASES]
+    result = {"rows": [rows[k] for k in order if k in rows]}
     file.write_text(json.dumps(result, indent=1) + "\n")
     file.with_suffix(".md").write_text(render(result))
 

@@ -1,7 +1,7 @@
 """Cost limits 0.5 and 0 (introduction).
 
-    python experiments/cost_limits.py run      # train what no other figure has trained
-    python experiments/cost_limits.py collect  # JSON, table and picture of what has run
+    python experiments/cost_limits.py run      # what no other has trained
+    python experiments/cost_limits.py collect  # JSON, table, picture of all runs
 
 See `paper.py` for the designs, the scales and the statistics.
 """

@@ -1,7 +1,7 @@
 """The cost of coming closer: max(d(t-1) - d(t), 0).
 
-    python experiments/dense_cost.py run      # train what no other figure has trained
-    python experiments/dense_cost.py collect  # JSON, table and picture of what has run
+    python experiments/dense_cost.py run      # what no other has trained
+    python experiments/dense_cost.py collect  # JSON, table, picture of all runs
 
 See `paper.py` for the designs, the scales and the statistics.
 """

@@ -1,7 +1,7 @@
 """Distance change, and its indicator (appendix).
 
-    python experiments/distance_change.py run      # train what no other figure has trained
-    python experiments/distance_change.py collect  # JSON, table and picture of what has run
+    python experiments/distance_change.py run      # what no other has trained
+    python experiments/distance_change.py collect  # JSON, table, picture of all runs
 
 See `paper.py` for the designs, the scales and the statistics.
 """

@@ -1,7 +1,7 @@
 """Safety margins against the evolved cost.
 
-    python experiments/margins.py run      # train what no other figure has trained
-    python experiments/margins.py collect  # JSON, table and picture of what has run
+    python experiments/margins.py run      # what no other has trained
+    python experiments/margins.py collect  # JSON, table, picture of all runs
 
 See `paper.py` for the designs, the scales and the statistics.
 """

@@ -1,7 +1,7 @@
 """Cost limits -0.1 and -1.
 
-    python experiments/negative_limits.py run      # train what no other figure has trained
-    python experiments/negative_limits.py collect  # JSON, table and picture of what has run
+    python experiments/negative_limits.py run      # what no other has trained
+    python experiments/negative_limits.py collect  # JSON, table, picture of all runs
 
 See `paper.py` for the designs, the scales and the statistics.
 """

@@ -1,7 +1,7 @@
 """Generalisation to other robots.
 
-    python experiments/other_robots.py run      # train what no other figure has trained
-    python experiments/other_robots.py collect  # JSON, table and picture of what has run
+    python experiments/other_robots.py run      # what no other has trained
+    python experiments/other_robots.py collect  # JSON, table, picture of all runs
 
 See `paper.py` for the designs, the scales and the statistics.
 """

@@ -1,7 +1,7 @@
 """Generalisation to other tasks and constraints.
 
-    python experiments/other_tasks.py run      # train what no other figure has trained
-    python experiments/other_tasks.py collect  # JSON, table and picture of what has run
+    python experiments/other_tasks.py run      # what no other has trained
+    python experiments/other_tasks.py collect  # JSON, table, picture of all runs
 
 See `paper.py` for the designs, the scales and the statistics.
 """

@@ -5,7 +5,7 @@ PPO-Lagrangian and CPO with every seed side by side (one table of slots), and se
 all figures that show it. A figure is a list of designs and worlds: `Figure`, `main`.
 
     python experiments/cost_limits.py run       # train what is not trained yet
-    python experiments/cost_limits.py collect   # JSON, table, picture of what has run
+    python experiments/cost_limits.py collect   # JSON, table, picture of all runs
 
 `--scale reduced` (default) fits a CPU and is no result of the paper's scale, which is
 `--scale paper`; `--smoke` shrinks everything to a minute. Runs can be stopped and
@@ -374,8 +374,8 @@ def smooth(values: Sequence[float], width: int = 5) -> np.ndarray:
     return (sums[end] - sums[start]) / (end - start)
 
 
-def arguments(description: str | None) -> argparse.Namespace:
-    """Flags of an experiment's script; devices and the compile cache are set up."""
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """The flags of an experiment's script."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("part", choices=("run", "collect"))
     parser.add_argument("--scale", choices=("reduced", "paper"), default="reduced")
@@ -383,6 +383,11 @@ def arguments(description: str | None) -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", default=(), help="worlds")
     parser.add_argument("--runs", type=Path, help="default: runs/figures/SCALE")
     parser.add_argument("--results", type=Path)
+    return parser
+
+
+def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """The parsed flags; devices and the compile cache are set up."""
     args = parser.parse_args()
     args.scale = "smoke" if args.smoke else args.scale
     args.runs = args.runs or Path("runs/figures") / args.scale
@@ -395,7 +400,7 @@ def arguments(description: str | None) -> argparse.Namespace:
 
 def main(figure: Figure, description: str | None) -> None:
     """The command line of a figure."""
-    args = arguments(description)
+    args = arguments(parser(description))
     if args.only:
         figure = figure._replace(worlds=tuple(args.only))
     if args.part == "run":

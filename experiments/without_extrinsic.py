@@ -1,7 +1,7 @@
 """With and without the extrinsic cost.
 
-    python experiments/without_extrinsic.py run      # train what no other figure has trained
-    python experiments/without_extrinsic.py collect  # JSON, table and picture of what has run
+    python experiments/without_extrinsic.py run      # what no other has trained
+    python experiments/without_extrinsic.py collect  # JSON, table, picture of all runs
 
 See `paper.py` for the designs, the scales and the statistics.
 """
