@@ -15,7 +15,7 @@ started again.
 import argparse
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -374,10 +374,14 @@ def smooth(values: Sequence[float], width: int = 5) -> np.ndarray:
     return (sums[end] - sums[start]) / (end - start)
 
 
-def parser(description: str | None) -> argparse.ArgumentParser:
+def parser(
+    description: str | None, parts: Iterable[str] = ("run", "collect")
+) -> argparse.ArgumentParser:
     """The flags of an experiment's script."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("part", choices=("run", "collect"))
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("part", choices=tuple(parts))
     parser.add_argument("--scale", choices=("reduced", "paper"), default="reduced")
     parser.add_argument("--smoke", action="store_true")
     parser.add_argument("--only", nargs="+", default=(), help="worlds")

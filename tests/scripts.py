@@ -8,7 +8,7 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).parents[1]
-NEIGHBOURS = ("common", "robots_tables")  # of scripts, imported by plain name
+NEIGHBOURS = ("common", "paper", "robots_tables")  # of scripts, imported by plain name
 
 
 def load_script(name: str) -> ModuleType:

@@ -138,6 +138,8 @@ BAD = {
         "mutation_high": (0.4, NAN, INF),  # 0.4 is below mutation_low
         "zero_tolerance": NOT_NEGATIVE,
         "selection": ("best", ""),
+        "start": ("uniform", ""),
+        "return_floor": FINITE,
     },
 }
 CASES = [

@@ -13,7 +13,9 @@ import pytest
 from autocost_jax.costs import (
     BANK,
     CostTerm,
+    cost_card,
     intrinsic_cost,
+    list_costs,
     load_cost,
     save_cost,
     total_cost,
@@ -186,6 +188,26 @@ def test_round_trip(tmp_path, name):
     stem = name.removesuffix(".npz").removesuffix(".json")
     assert sorted(os.listdir(tmp_path)) == [f"{stem}.json", f"{stem}.npz"]
     assert json.loads((tmp_path / f"{stem}.json").read_text()) == {"stage": 3}
+
+
+def test_costs_of_the_package_load_by_name(tmp_path, monkeypatch):
+    assert "ic4srl" in list_costs()
+    for name in list_costs():
+        theta = load_cost(name)
+        assert theta.shape == (41,)
+        assert bool(jnp.isfinite(theta).all())
+        card = cost_card(name)
+        assert {"found", "budget", "validation", "fails"} <= set(card)
+    monkeypatch.chdir(tmp_path)  # saving goes to the current folder, not the package
+    save_cost("ic4srl", np.ones(41), {})
+    assert sorted(os.listdir(tmp_path)) == ["ic4srl.json", "ic4srl.npz"]
+    assert not bool((load_cost("ic4srl") == 1).all())
+    assert bool((load_cost("./ic4srl.npz") == 1).all())
+
+
+def test_a_missing_card_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"cost\.json is not a readable card"):
+        cost_card(tmp_path / "cost")
 
 
 def test_names_with_dots_do_not_overwrite_each_other(tmp_path):

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from autocost_jax.config import SearchConfig
+from autocost_jax.costs import intrinsic_cost
 from autocost_jax.es import (
+    QUIET_COST,
     Fitness,
     best,
+    monotone_start,
     mutate,
     rank,
     select,
@@ -102,6 +105,63 @@ def test_ties_fall_to_the_earlier_candidate():
 def test_equal_costs_fall_to_the_higher_return():
     fitness = make_fitness([3.0, 3.0, 3.0], [1.0, 7.0, 4.0])
     assert rank(fitness).tolist() == [1, 2, 0]
+
+
+def test_below_the_floor_only_the_return_counts():
+    """Behind all others, however safe, but before what is not finite."""
+    costs = [0.0, 3.0, 1.0, 0.5, np.nan, 1.0]
+    returns = [-2.0, 4.0, 2.0, 1.9, 9.0, 5.0]
+    fitness = make_fitness(costs, returns)
+    assert rank(fitness, return_floor=2.0).tolist() == [5, 2, 1, 3, 0, 4]
+    assert selected(fitness, return_floor=2.0) == [5, 2]
+    assert rank(fitness).tolist() == rank(fitness, return_floor=-3.0).tolist()
+
+
+def test_a_floor_that_nobody_reaches_asks_for_return():
+    fitness = make_fitness([0.0, 3.0, 1.0], [0.0, 1.0, -1.0])
+    assert rank(fitness, return_floor=10.0).tolist() == [1, 0, 2]
+
+
+def test_best_with_a_floor_is_useful(key):
+    es = truncation_es(dataclasses.replace(SMALL, return_floor=1.0))
+    candidates = es.ask(key, es.init())
+    size = len(candidates)
+    fitness = make_fitness([0.0, *[2.0] * (size - 1)], [0.0, *[3.0] * (size - 1)])
+    state = es.tell(key, es.init(), candidates, fitness)
+    assert int(best(state, size).index) == 0
+    assert int(best(state, size, return_floor=1.0).index) == 1
+    np.testing.assert_array_equal(state.elites[0], candidates[1])
+
+
+def lidars_of(distance, count=64):
+    """Readings of one object at a distance, in directions all around."""
+    bins = jax.random.uniform(jax.random.key(5), (count, 8))
+    nearest = jax.nn.one_hot(jnp.arange(count) % 8, 8)
+    return 0.1 * bins + nearest * jnp.exp(-distance)
+
+
+def test_a_monotone_start_never_falls_as_something_comes_nearer(key):
+    places = lidars_of(1.0)
+    theta = monotone_start(key, 50, 5.0, places)
+    assert theta.shape == (50, 41)
+    near = jax.vmap(lambda theta: intrinsic_cost(theta, lidars_of(0.2)))(theta)
+    far = jax.vmap(lambda theta: intrinsic_cost(theta, lidars_of(0.9)))(theta)
+    assert bool((near >= far).all())
+    assert float(jnp.mean(near[:, :8])) > 3 * float(jnp.mean(far[:, :8]))
+    typical = jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta)
+    middle = np.median(np.asarray(typical), axis=1)
+    np.testing.assert_allclose(middle, QUIET_COST, rtol=0.05)
+
+
+def test_another_start_replaces_the_first_candidates_alone(key):
+    start = jnp.full((SMALL.population_size, 41), 7.0)
+    es = truncation_es(SMALL, lambda key: start)
+    first = es.ask(key, es.init())
+    np.testing.assert_array_equal(first, start)
+    fitness = make_fitness([1.0] * len(first), [1.0] * len(first))
+    state = es.tell(key, es.init(), first, fitness)
+    later = es.ask(key, state)
+    assert not bool((later == 7.0).all())
 
 
 def test_the_order_of_candidates_is_irrelevant(key):

@@ -150,6 +150,8 @@ def test_the_tables_are_those_of_the_committed_json(script, result):
         "--coordinator",
         "--num-processes",
         "--process-id",
+        "--start",
+        "--return-floor",
     ],
 )
 def test_flags_of_the_readme_exist(flag, capsys):

@@ -17,7 +17,9 @@ from autocost_jax.config import (
 from autocost_jax.costs import (
     BANK,
     CostTerm,
+    cost_card,
     intrinsic_cost,
+    list_costs,
     load_cost,
     save_cost,
     total_cost,
@@ -25,7 +27,15 @@ from autocost_jax.costs import (
 )
 from autocost_jax.env_config import EnvConfig, env_config
 from autocost_jax.envs.env import Env, list_envs, make_env
-from autocost_jax.es import ES, Fitness, best, mutate, select, truncation_es
+from autocost_jax.es import (
+    ES,
+    Fitness,
+    best,
+    monotone_start,
+    mutate,
+    select,
+    truncation_es,
+)
 from autocost_jax.evaluate import evaluate
 from autocost_jax.evolution import evolve, search
 from autocost_jax.population import make_population, stack_slots
@@ -64,15 +74,18 @@ __all__ = [
     "TrainingCost",
     "Trajectory",
     "best",
+    "cost_card",
     "cpo",
     "env_config",
     "evaluate",
     "evolve",
     "intrinsic_cost",
+    "list_costs",
     "list_envs",
     "load_cost",
     "make_env",
     "make_population",
+    "monotone_start",
     "mutate",
     "ppo_lagrangian",
     "preset",

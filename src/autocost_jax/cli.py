@@ -64,7 +64,8 @@ def _train(argv: list[str]) -> None:
           algorithms: ppo, ppo_lagrangian, cpo: one method each.
           cost: terms of the cost bank, such as "extrinsic+0.1*safety_margin_2x".
           limit: allowed training cost of an episode.
-          theta: cost.npz with the intrinsic network, if the cost uses it.
+          theta: cost.npz with the intrinsic network, if the cost uses it; or the name
+            of one that `autocost info` lists.
           num_seeds: seeds 0 ... N - 1.
           preset: whose sizes the other flags default to.
           out: run directory.
@@ -389,7 +390,7 @@ def _info(argv: list[str]) -> None:
         print(yaml.safe_dump(read_document(options.run), sort_keys=False), end="")
         return
     from autocost_jax.config import PRESETS
-    from autocost_jax.costs import BANK
+    from autocost_jax.costs import BANK, list_costs
     from autocost_jax.env_config import ENVS, SUITE
     from autocost_jax.store import run_facts
 
@@ -400,6 +401,7 @@ def _info(argv: list[str]) -> None:
         "safety gym suite": list(SUITE),
         "presets": {name: f"{p.env_steps:,} env steps" for name, p in PRESETS.items()},
         "cost terms": [term.name for term in BANK],
+        "found costs": list_costs(),
     }
     print(yaml.safe_dump(facts, sort_keys=False), end="")
 

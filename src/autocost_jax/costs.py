@@ -10,6 +10,7 @@ passing a longer bank.
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -200,15 +201,24 @@ def save_cost(
     Raises:
       ValueError: if theta is not 41 finite numbers, or the card not JSON.
     """
-    file, theta = _cost_file(path), np.asarray(theta, np.float32)
+    file, theta = _npz(Path(path)), np.asarray(theta, np.float32)
     _check_theta(file, theta)
     text = json.dumps(dict(card), indent=2, allow_nan=False)
     np.savez(file, theta=theta)
     file.with_suffix(".json").write_text(text + "\n")
 
 
+def list_costs() -> list[str]:
+    """Names of the costs that the package brings along."""
+    files = (resources.files("autocost_jax") / "found").iterdir()
+    return sorted(file.name[:-4] for file in files if file.name.endswith(".npz"))
+
+
 def load_cost(path: str | Path) -> jax.Array:
-    """The parameters theta [41] of a saved cost.
+    """The parameters theta [41] of a saved cost, or of one the package brings along.
+
+    Args:
+      path: a name of `list_costs`, which goes before a file of that name, or a file.
 
     Raises:
       ValueError: if the file is missing or is not a cost: one line naming it.
@@ -217,6 +227,22 @@ def load_cost(path: str | Path) -> jax.Array:
     theta = np.asarray(load_arrays(file).get("theta", ()))
     _check_theta(file, theta)
     return jnp.asarray(theta, jnp.float32)
+
+
+def cost_card(path: str | Path) -> dict[str, Any]:
+    """The card of a saved cost: how it was found, its scores, where it fails.
+
+    Args:
+      path: as in `load_cost`.
+
+    Raises:
+      ValueError: if there is no readable card: one line naming it.
+    """
+    file = _cost_file(path).with_suffix(".json")
+    try:
+        return json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{file} is not a readable card: {error}") from None
 
 
 def _check_theta(file: Path, theta: np.ndarray) -> None:
@@ -229,7 +255,13 @@ def _check_theta(file: Path, theta: np.ndarray) -> None:
 
 
 def _cost_file(path: str | Path) -> Path:
+    """The file of a cost that the package brings along, or of a path."""
+    if str(path) in list_costs():
+        return _npz(Path(str(resources.files("autocost_jax") / "found" / str(path))))
+    return _npz(Path(path))
+
+
+def _npz(path: Path) -> Path:
     """`<path>.npz`, unless the path already says so; other dots belong to the name."""
-    path = Path(path)
     name = path.stem if path.suffix in (".npz", ".json") else path.name
     return path.with_name(f"{name}.npz")

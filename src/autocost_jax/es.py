@@ -261,20 +261,17 @@ def truncation_es(
             )
         else:
             parents = candidates[jax.random.permutation(key, size)[:elites]]
-        start = state.generation * size
+        place = state.generation * size
+
+        def put(old: jax.Array, new: jax.Array) -> jax.Array:
+            new = new.astype(old.dtype)
+            return jax.lax.dynamic_update_slice_in_dim(old, new, place, 0)
+
         return ESState(
             generation=state.generation + 1,
             elites=parents,
-            archive=jax.lax.dynamic_update_slice_in_dim(
-                state.archive, candidates, start, 0
-            ),
-            archive_fitness=jax.tree.map(
-                lambda all_, new: jax.lax.dynamic_update_slice_in_dim(
-                    all_, new.astype(all_.dtype), start, 0
-                ),
-                state.archive_fitness,
-                fitness,
-            ),
+            archive=put(state.archive, candidates),
+            archive_fitness=jax.tree.map(put, state.archive_fitness, fitness),
         )
 
     return ES(init, ask, tell)

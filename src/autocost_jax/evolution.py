@@ -393,6 +393,14 @@ def _tracked(metrics: tuple[Metrics, ...]) -> Metrics:
     return {name: jnp.stack([group[name] for group in metrics], 1) for name in TRACKED}
 
 
+def pick_label(config: SearchConfig, is_zero: bool) -> str:
+    """In words, by which rule the final pick of a search was made."""
+    label = "zero violation, highest return" if is_zero else "lowest cost"
+    if config.return_floor is None:
+        return label
+    return f"{label} of those that return at least {config.return_floor:g}, if any"
+
+
 def best_of(config: SearchConfig, state: ESState) -> Any:
     """The search's final pick, `es.Best`."""
     return es_lib.best(

@@ -25,6 +25,7 @@ from autocost_jax.evolution import (
     evolve,
     init_search,
     make_searcher,
+    pick_label,
 )
 from autocost_jax.policies import (
     EVALUATION,
@@ -336,9 +337,8 @@ def _finish(
     key = jax.random.fold_in(searcher.root, EVALUATION)
     evaluator = make_evaluator(env, agent, num_episodes, watch=watch_first)
     results, episodes = evaluator(states, key)
-    is_zero = bool(best.zero_violation)
     card = {
-        "label": "zero violation, highest return" if is_zero else "lowest cost",
+        "label": pick_label(config, bool(best.zero_violation)),
         "environment": config.train.env.name,
         "stage": stage,
         "index": int(best.index),

@@ -4,10 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.arrays import RunDirError, load_arrays
 from autocost_jax.config import SearchConfig
+from autocost_jax.es import Fitness, rank
+from autocost_jax.evolution import pick_label
 from autocost_jax.report import (
     BestCandidate,
     Curve,
@@ -41,7 +44,7 @@ def load_report(path: str | Path) -> ReportData:
         obstacle=obstacle[:-1],
         obstacle_radius=getattr(config.train.env, f"{obstacle}_size"),
         stages=stages,
-        best=_best(stages, card),
+        best=_best(config, stages, card),
         curves=tuple(_curves(config, rows)),
         replay=_replay(path, config),
         evaluations=tuple(
@@ -95,20 +98,20 @@ def _known_mean(values: np.ndarray) -> np.ndarray:
 
 
 def _best(
-    stages: tuple[StageRecord, ...], card: dict[str, Any]
+    config: SearchConfig, stages: tuple[StageRecord, ...], card: dict[str, Any]
 ) -> BestCandidate | None:
     """The card's pick; before there is one, the best of the finished stages."""
-    ranked = [
-        (max(cost, 0.0) if not zero else 0.0, -ep_return, number, index)
-        for number, stage in enumerate(stages)
-        for index, (cost, ep_return, zero) in enumerate(
-            zip(stage.cost, stage.ep_return, stage.zero_violation, strict=True)
-        )
-        if np.isfinite(cost) and np.isfinite(ep_return)
-    ]
-    if not ranked:
+    if not stages:
         return None
-    number, index = min(ranked)[2:]
+    costs, returns = (
+        np.concatenate([getattr(stage, name) for stage in stages])
+        for name in ("cost", "ep_return")
+    )
+    fitness = Fitness(jnp.asarray(costs), jnp.asarray(returns))
+    first = int(rank(fitness, config.zero_tolerance, config.return_floor)[0])
+    if not np.isfinite([costs[first], returns[first]]).all():
+        return None
+    number, index = divmod(first, config.population_size)
     number, index = card.get("stage", number), card.get("index", index)
     stage = stages[number]
     is_zero = bool(stage.zero_violation[index])
@@ -117,7 +120,7 @@ def _best(
         stage=number,
         index=index,
         theta=stage.theta[index],
-        label="zero violation, highest return" if is_zero else "lowest cost",
+        label=pick_label(config, is_zero),
         card=tuple(f"{key}: {card[key]}" for key in shown if key in card),
     )
 
