@@ -131,11 +131,11 @@ def collect(runs: Path, results: Path, scale: str) -> None:
         "rows": rows,
     }
     file = paper.write(result, "transfer", results)
-    file.with_suffix(".md").write_text(render(rows))
+    file.with_suffix(".md").write_text(render(result))
     print(file)
 
 
-def render(rows: Sequence[dict[str, Any]]) -> str:
+def render(result: dict[str, Any]) -> str:
     """A line a method."""
 
     def cell(value: dict[str, Any], digits: int) -> str:
@@ -151,7 +151,7 @@ def render(rows: Sequence[dict[str, Any]]) -> str:
         "| cost, likewise | violating episodes there, here, difference (95 %) |",
         "|---|---|---|---|---|",
     ]
-    for row in rows:
+    for row in result["rows"]:
         gap = row["violations"]["difference"]
         lines.append(
             f"| {row['world']} | {paper.label(row['design'], row['method'])} "

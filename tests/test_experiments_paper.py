@@ -1,6 +1,7 @@
 """The figures of the paper: what is trained, how it is counted, and one end to end."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -53,6 +54,18 @@ def test_the_scale_of_the_paper_is_its_preset():
     assert (train.num_worlds, train.num_epochs) == (30, 333)
     assert train.agent.hidden_sizes == (256, 256)
     assert train.agent.policy_minibatches == 1
+
+
+def test_the_tables_of_the_readme_are_those_of_the_results():
+    text = (ROOT / "experiments" / "README.md").read_text()
+    blocks = re.findall(r"<!-- (reduced/\w+) -->\n(.*?)<!-- end -->", text, re.DOTALL)
+    assert {name for name, _ in blocks} >= {"reduced/evolution", "reduced/margins"}
+    for name, shown in blocks:
+        file = ROOT / "experiments" / "results" / f"{name}.json"
+        result = json.loads(file.read_text())
+        render = {"evolution": searches.render, "transfer": transfer.render}
+        expect = render.get(file.stem, paper.render)(result)
+        assert shown.strip() == expect.strip(), name
 
 
 def row(ep_return, cost, violating, episodes=100):

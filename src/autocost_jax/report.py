@@ -132,10 +132,10 @@ def verdict(data: ReportData) -> str:
             f"{text}; the zero-violation candidate with the highest return is {best}."
         )
     if any_zero:
-        return f"{text}; the one shown as best has the lowest cost: {best}."
+        return f"{text}; the one shown as best has the {data.best.label}: {best}."
     return (
         f"{text}; no candidate of the search reached zero violations, and the one "
-        f"with the lowest cost is {best}."
+        f"with the {data.best.label} is {best}."
     )
 
 
