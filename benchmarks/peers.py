@@ -223,12 +223,11 @@ def main() -> None:
         rate = measure_ours(case, devices).env_steps_per_second
         row = {**case._asdict(), "peer_rate": theirs, "why": why, "rate": rate}
         print(json.dumps(row), flush=True)
-        row = json.loads(json.dumps(row | stamp))
-        rows[key(row)] = row
-    order = [key(json.loads(json.dumps(case._asdict()))) for case in CASES]
-    result = {"rows": [rows[k] for k in order if k in rows]}
-    file.write_text(json.dumps(result, indent=1) + "\n")
-    file.with_suffix(".md").write_text(render(result))
+        rows[key(row)] = row | stamp
+        known = [key(case._asdict()) for case in CASES]
+        result = {"rows": [rows[name] for name in known if name in rows]}
+        file.write_text(json.dumps(result, indent=1) + "\n")
+        file.with_suffix(".md").write_text(render(result))
 
 
 if __name__ == "__main__":

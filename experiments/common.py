@@ -12,6 +12,8 @@ import numpy as np
 
 from autocost_jax.commandline import use_devices
 from autocost_jax.methods import TableConfig, run_table
+from autocost_jax.rundata import first_difference
+from autocost_jax.store import read_config
 
 
 class Options(NamedTuple):
@@ -59,12 +61,26 @@ def run_part(
 
 
 def run_if_needed(config: TableConfig, path: Path, num_episodes: int) -> None:
-    """Train a table unless that is done; continue where it was stopped."""
+    """Train a table unless that is done; continue where it was stopped.
+
+    Raises:
+      SystemExit: the directory holds another table, such as one of an older cost.
+    """
+    if (path / "config.yaml").exists():
+        check_same(config, path)
     if (path / "evaluation.json").exists():
         return
     resume = (path / "config.yaml").exists()
     devices = jax.devices()
     run_table(config, path, resume=resume, devices=devices, num_episodes=num_episodes)
+
+
+def check_same(config: TableConfig, path: Path) -> None:
+    """End the program if a run directory is not that of a table."""
+    difference = first_difference(read_config(path, TableConfig)[0], config)
+    if difference is not None:
+        name, old, new = difference
+        raise SystemExit(f"{path} has {name}={old}, wanted {name}={new}: remove it")
 
 
 def t_interval(values: Sequence[float] | np.ndarray) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import compact, run_if_needed
+from common import check_same, compact, run_if_needed
 
 from autocost_jax import TrainConfig, env_config, load_cost, preset
 from autocost_jax.commandline import use_compile_cache, use_devices
@@ -160,9 +160,10 @@ def run(figure: Figure, scale: Scale, runs: Path) -> None:
             run_if_needed(config, run_dir(runs, world, design), scale.episodes)
 
 
-def scores(path: Path) -> dict[str, Any]:
+def scores(path: Path, wanted: TableConfig) -> dict[str, Any]:
     """Of one trained design: for each algorithm its scores, and its curves."""
-    config = read_config(path, TableConfig)[0]
+    check_same(wanted, path)
+    config, facts = read_config(path, TableConfig)
     rows = json.loads((path / "evaluation.json").read_text())["rows"]
     metrics = read_metrics(path)
     result: dict[str, Any] = {}
@@ -177,7 +178,8 @@ def scores(path: Path) -> dict[str, Any]:
             }
     train = config.train
     steps = train.num_worlds * train.env.num_steps * train.num_epochs
-    return {"steps_a_slot": steps, "algorithms": result}
+    run = {name: facts[name] for name in ("commit", "created", "num_devices")}
+    return {"steps_a_slot": steps, "trained": run, "algorithms": result}
 
 
 def curve(values: Sequence[np.ndarray]) -> dict[str, list[float]]:
@@ -193,6 +195,7 @@ def curve(values: Sequence[np.ndarray]) -> dict[str, list[float]]:
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Scores over seeds with bootstrap intervals, and the pooled rate of violations."""
     episodes = sum(row["episodes"] for row in rows)
+    layouts = min(row["episodes"] for row in rows)  # all policies meet the same ones
     violations = sum(round(row["violation_rate"] * row["episodes"]) for row in rows)
     return {
         "return": bootstrap([row["return_mean"] for row in rows]),
@@ -204,7 +207,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "episodes": episodes,
         "violations": violations,
         "violation_rate": violations / episodes,
-        "violation_rate_upper": upper_bound(violations, episodes),
+        "violation_rate_upper": upper_bound(violations / episodes, layouts),
     }
 
 
@@ -222,17 +225,17 @@ def bootstrap(values: Sequence[float], draws: int = 10_000) -> dict[str, Any]:
     }
 
 
-def upper_bound(violations: int, episodes: int) -> float:
-    """One-sided 95 % Clopper-Pearson bound of a rate; zero of N gives about 3 / N.
+def upper_bound(rate: float, layouts: int) -> float:
+    """One-sided 95 % Clopper-Pearson bound of a rate; zero in N gives about 3 / N.
 
-    It takes episodes as independent: those of one policy share its faults, so that it
-    speaks of these policies, not of training.
+    N is the number of layouts, not of episodes: the policies of all seeds play the same
+    ones. The bound speaks of these policies, not of training anew.
     """
     from scipy.stats import beta
 
-    if violations >= episodes:
+    if rate >= 1:
         return 1.0
-    return float(beta.ppf(0.95, violations + 1, episodes - violations))
+    return float(beta.ppf(0.95, rate * layouts + 1, (1 - rate) * layouts))
 
 
 def collect(figure: Figure, scale_name: str, runs: Path, results: Path) -> None:
@@ -240,7 +243,7 @@ def collect(figure: Figure, scale_name: str, runs: Path, results: Path) -> None:
     scale = scales()[scale_name]
     panels = {
         world: {
-            design: scores(run_dir(runs, world, design))
+            design: scores(run_dir(runs, world, design), table(world, design, scale))
             for design in figure.designs
             if (run_dir(runs, world, design) / "evaluation.json").exists()
         }
@@ -252,7 +255,8 @@ def collect(figure: Figure, scale_name: str, runs: Path, results: Path) -> None:
         "title": figure.title,
         "paper": figure.paper,
         "scale": scale_name,
-        "command": f"python experiments/{figure.name}.py run --scale {scale_name}",
+        "command": f"python experiments/{figure.name}.py run "
+        + ("--smoke" if scale_name == "smoke" else f"--scale {scale_name}"),
         "seeds": list(scale.seeds),
         "facts": facts,
         "worlds": {world: panel for world, panel in panels.items() if panel},
@@ -375,16 +379,17 @@ def smooth(values: Sequence[float], width: int = 5) -> np.ndarray:
 
 
 def parser(
-    description: str | None, parts: Iterable[str] = ("run", "collect")
+    description: str | None,
+    parts: Iterable[str] = ("run", "collect"),
+    scales: Sequence[str] = ("reduced", "paper"),
 ) -> argparse.ArgumentParser:
     """The flags of an experiment's script."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("part", choices=tuple(parts))
-    parser.add_argument("--scale", choices=("reduced", "paper"), default="reduced")
+    parser.add_argument("--scale", choices=scales, default="reduced")
     parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--only", nargs="+", default=(), help="worlds")
     parser.add_argument("--runs", type=Path, help="default: runs/figures/SCALE")
     parser.add_argument("--results", type=Path)
     return parser
@@ -404,10 +409,11 @@ def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
 def main(figure: Figure, description: str | None) -> None:
     """The command line of a figure."""
-    args = arguments(parser(description))
-    if args.only:
-        figure = figure._replace(worlds=tuple(args.only))
+    flags = parser(description)
+    flags.add_argument("--only", nargs="+", choices=figure.worlds, help="what to run")
+    args = arguments(flags)
     if args.part == "run":
+        figure = figure._replace(worlds=tuple(args.only or figure.worlds))
         run(figure, scales()[args.scale], args.runs)
     else:
         collect(figure, args.scale, args.runs, args.results)

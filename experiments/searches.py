@@ -7,8 +7,8 @@
 
 Both rules have the same budget, learners and mutations, and meet the same layouts.
 "paper" starts from N(0, 5^2) and selects as the paper does; "guided" starts from costs
-that rise as anything comes nearer (`es.monotone_start`) and ranks candidates that
-return less than 2 an episode behind all others (`es.rank`). Reduced scale: 12
+that rise as anything comes nearer (`es.monotone_start`, std 8) and ranks candidates
+that return less than 2 an episode behind all others (`es.rank`). Reduced scale: 12
 candidates, 4 stages, 512,000 steps a slot; 3 search seeds. `--smoke` is for tests.
 """
 
@@ -324,5 +324,5 @@ def draw_heat_map(args: argparse.Namespace) -> None:
 PARTS = {"run": run, "validate": validate, "ship": ship, "collect": collect}
 
 if __name__ == "__main__":
-    options = paper.arguments(paper.parser(__doc__, PARTS))
+    options = paper.arguments(paper.parser(__doc__, PARTS, scales=("reduced",)))
     PARTS[options.part](options)

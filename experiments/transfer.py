@@ -45,7 +45,9 @@ def run(runs: Path, python: Path, episodes: int) -> None:
             method, _, seed = policy.stem.rpartition("_seed")
             robot = env_config(world).robot
             words = [str(python), str(SCRIPT), str(policy), robot, str(episodes), seed]
-            done = subprocess.run(words, capture_output=True, text=True, check=True)
+            done = subprocess.run(words, capture_output=True, text=True, check=False)
+            if done.returncode:
+                raise SystemExit(f"{policy}: {done.stderr.strip()[-500:]}")
             rows.append(
                 {"method": method, "seed": int(seed)}
                 | json.loads(done.stdout.splitlines()[-1])

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -125,7 +126,7 @@ def test_a_crash_ends_the_others_and_one_process_can_go_on(environment, tmp_path
 
 
 def test_a_table_in_two_processes_is_that_of_one(environment, tmp_path):
-    """`autocost train`: same metrics and scores, written once, and resumable."""
+    """`autocost train`: the same numbers, written once; resumed in the middle."""
     flags = ["--preset", "smoke", "--physics", "closed_form", "--num-seeds", "2"]
     flags += ["--algorithms", "ppo", "cpo", "--episodes", "4"]
     both = start_both(tmp_path / "both", environment, *flags, command=TABLE)
@@ -141,13 +142,23 @@ def test_a_table_in_two_processes_is_that_of_one(environment, tmp_path):
     for two, one in zip(*scores, strict=True):
         assert two["method"] == one["method"]
         assert two["return_mean"] == pytest.approx(one["return_mean"], abs=1e-3)
-    assert len(read_metrics(tmp_path / "both")) == 2
+        assert two["cost_mean"] == pytest.approx(one["cost_mean"], abs=1e-3)
+    lines = [line for line in said[1].splitlines() if not line.startswith("[Gloo]")]
+    assert lines == []
+    rows = read_metrics(tmp_path / "both")
+    assert [row["epoch"] for row in rows] == [0, 1]
+    for two, one in zip(rows, read_metrics(tmp_path / "one"), strict=True):
+        np.testing.assert_allclose(
+            two["cpo/ep_return"], one["cpo/ep_return"], atol=1e-3
+        )
+    shutil.rmtree(max((tmp_path / "both" / "checkpoints").glob("step_*")))
     again = start_both(
         tmp_path / "both", environment, "--resume", "--episodes", "4", command=TABLE
     )
     said = [process.communicate(timeout=WAIT)[0] for process in again]
     assert [process.returncode for process in again] == [0, 0], said
-    assert "resuming" in said[0]
+    assert "after 1 epochs" in said[0]
+    assert [row["epoch"] for row in read_metrics(tmp_path / "both")] == [0, 1]
 
 
 @pytest.mark.parametrize(

@@ -198,8 +198,10 @@ def test_costs_of_the_package_load_by_name(tmp_path, monkeypatch):
         assert bool(jnp.isfinite(theta).all())
         card = cost_card(name)
         assert {"found", "budget", "validation", "fails"} <= set(card)
-    monkeypatch.chdir(tmp_path)  # saving goes to the current folder, not the package
-    save_cost("ic4srl", np.ones(41), {})
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="a cost of the package"):
+        save_cost("ic4srl", np.ones(41), {})
+    save_cost("./ic4srl", np.ones(41), {})
     assert sorted(os.listdir(tmp_path)) == ["ic4srl.json", "ic4srl.npz"]
     assert not bool((load_cost("ic4srl") == 1).all())
     assert bool((load_cost("./ic4srl.npz") == 1).all())

@@ -1,5 +1,7 @@
 """The figures of the paper: what is trained, how it is counted, and one end to end."""
 
+import argparse
+import dataclasses
 import json
 import re
 import subprocess
@@ -8,7 +10,10 @@ import sys
 import numpy as np
 import pytest
 
+from autocost_jax import cost_card, load_cost, preset
 from autocost_jax.env_config import ENVS
+from autocost_jax.methods import Method, TableConfig
+from autocost_jax.store import RunDir
 from scripts import ROOT, load_script
 
 FIGURES = (
@@ -22,6 +27,7 @@ FIGURES = (
     "without_extrinsic",
     "total_cost",
 )
+common = load_script("experiments/common")
 paper = load_script("experiments/paper")
 searches = load_script("experiments/searches")
 transfer = load_script("experiments/transfer")
@@ -89,12 +95,17 @@ def test_scores_are_over_seeds_and_violations_are_pooled():
 
 
 @pytest.mark.parametrize(
-    ("violations", "episodes", "bound"),
-    [(0, 1000, 0.002991), (0, 30, 0.0950), (1, 10, 0.3942), (10, 10, 1.0)],
+    ("rate", "layouts", "bound"),
+    [(0.0, 1000, 0.002991), (0.0, 30, 0.0950), (0.1, 10, 0.3942), (1.0, 10, 1.0)],
 )
-def test_the_bound_of_a_rate(violations, episodes, bound):
-    """Zero of N is about 3 / N; 1 of 10 is 0.394 in tables of the exact bound."""
-    assert paper.upper_bound(violations, episodes) == pytest.approx(bound, abs=1e-4)
+def test_the_bound_of_a_rate(rate, layouts, bound):
+    """Zero in N is about 3 / N; 1 of 10 is 0.394 in tables of the exact bound."""
+    assert paper.upper_bound(rate, layouts) == pytest.approx(bound, abs=1e-4)
+
+
+def test_seeds_that_play_the_same_layouts_do_not_tighten_the_bound():
+    one, three = (paper.summarise([row(1.0, 0.1, 4)] * count) for count in (1, 3))
+    assert three["violation_rate_upper"] == one["violation_rate_upper"]
 
 
 def test_smoothing_is_a_mean_over_the_last_epochs():
@@ -122,10 +133,74 @@ def test_policies_are_compared_one_by_one():
     assert result["violations"]["difference"]["mean"] == pytest.approx(0.0)
 
 
-def test_rules_of_the_search_differ_in_start_and_floor_alone():
-    assert searches.RULES["paper"] == ()
-    flags = searches.RULES["guided"][::2]
-    assert flags == ("--start", "--init-std", "--return-floor")
+def test_a_run_of_another_cost_is_not_taken_for_this_one(tmp_path):
+    scale = paper.scales()["smoke"]
+    old = paper.table("Goal-Hazard-Point", "extrinsic", scale)
+    RunDir.create(tmp_path / "run", old).close()
+    common.check_same(old, tmp_path / "run")
+    new = paper.table("Goal-Hazard-Point", "limit_-1", scale)
+    with pytest.raises(SystemExit, match=r"limit=0\.0, wanted .*limit=-1\.0"):
+        common.check_same(new, tmp_path / "run")
+
+
+def write_search(runs, costs, returns):
+    """A finished search of two stages; candidate 1 of the first is trained again."""
+    config = dataclasses.replace(preset("smoke"), seed=0)
+    theta = np.arange(8 * 41, dtype=np.float32).reshape(2, 4, 41)
+    theta[1, 0] = theta[0, 1]
+    with RunDir.create(searches.folder(runs, "guided", 0), config) as run:
+        for stage in range(2):
+            run.write_stage(
+                stage,
+                {
+                    "theta": theta[stage],
+                    "cost": np.float32(costs[stage]),
+                    "ep_return": np.float32(returns[stage]),
+                },
+            )
+        run.write_cost({"theta": theta[0, 0]}, {"search_cost": 0.0})
+    return theta
+
+
+def write_validation(runs, scores):
+    """Scores of each finalist, (return, cost, violating of 100) by algorithm."""
+    methods, rows = [], []
+    for i, row_of in enumerate(searches.finalists(runs)):
+        theta = tuple(row_of["theta"].tolist())
+        for algorithm, score in zip(paper.BOTH, scores[i], strict=True):
+            label = f"{i}-{algorithm}"
+            methods.append(Method(label, algorithm, paper.WITH_NETWORK, 0.0, theta))
+            rows.append({"method": label, "seed": 100} | row(*score))
+    config = TableConfig(preset("smoke").train, tuple(methods), (100,))
+    with RunDir.create(runs / "validation", config) as run:
+        run.write_json("evaluation", {"episodes": 100, "rows": rows})
+
+
+def test_the_shipped_cost_is_the_best_useful_finalist(tmp_path):
+    """Timid candidates come last, one that was trained twice counts by its mean."""
+    costs = [[0.0, 1.0, 0.5, 9.0], [3.0, 4.0, 5.0, 6.0]]
+    returns = [[-3.0, 5.0, 1.0, 9.0], [7.0, 6.0, 5.0, 4.0]]
+    runs = tmp_path / "runs"
+    theta = write_search(runs, costs, returns)
+    found = searches.finalists(runs)
+    assert [row["index"] for row in found] == [1, 1, 2, 3]
+    assert (found[0]["cost"], found[0]["times_trained"]) == (2.0, 2)
+    worst, best = [(1.0, 0.0, 0)] * 2, [(4.0, 0.1, 3), (3.0, 0.0, 0)]
+    write_validation(runs, [worst, best, [(9.0, 4.0, 60)] * 2, [(9.0, 3.0, 50)] * 2])
+    args = argparse.Namespace(runs=runs, results=tmp_path, smoke=True, scale="smoke")
+    searches.ship(args)
+    shipped = load_cost(tmp_path / "costs" / "ic4srl")
+    np.testing.assert_array_equal(shipped, found[1]["theta"])
+    np.testing.assert_array_equal(found[1]["theta"], theta[1, 1])
+    card = cost_card(tmp_path / "costs" / "ic4srl")
+    assert card["fails"] == "not free of violations under PPO-Lag"
+    assert card["validation"]["cpo"]["violation_rate_upper"] > 0
+    assert len(list((tmp_path / "costs").glob("runner_up_*.npz"))) == 3
+    searches.collect(args)
+    table = (tmp_path / "evolution.md").read_text()
+    assert "| guided, 0 | 2.62, 4.50 | 0.00, 3.00 |" in table
+    assert (tmp_path / "heat_map.png").exists()
+    assert (tmp_path / "evolution.png").exists()
 
 
 def test_one_figure_from_training_to_picture(tmp_path):

@@ -265,7 +265,6 @@ def test_small_costs_do_not_read_as_zero():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"label": "lowest cost"}, r"best\.label"),
         ({"index": 99}, r"best\.index"),
         ({"stage": 9}, r"best\.stage"),
         ({"theta": np.zeros(40)}, r"best\.theta"),

@@ -199,8 +199,11 @@ def save_cost(
     """Write `<path>.npz` (theta [41], float32) and `<path>.json` (its card).
 
     Raises:
-      ValueError: if theta is not 41 finite numbers, or the card not JSON.
+      ValueError: if theta is not 41 finite numbers, the card not JSON, or the path a
+        name of `list_costs`, by which `load_cost` would not find it again.
     """
+    if str(path) in list_costs():
+        raise ValueError(f"{path} is a cost of the package: write to ./{path} instead")
     file, theta = _npz(Path(path)), np.asarray(theta, np.float32)
     _check_theta(file, theta)
     text = json.dumps(dict(card), indent=2, allow_nan=False)
@@ -210,7 +213,8 @@ def save_cost(
 
 def list_costs() -> list[str]:
     """Names of the costs that the package brings along."""
-    files = (resources.files("autocost_jax") / "found").iterdir()
+    folder = resources.files("autocost_jax") / "found"
+    files = folder.iterdir() if folder.is_dir() else ()
     return sorted(file.name[:-4] for file in files if file.name.endswith(".npz"))
 
 

@@ -57,8 +57,8 @@ class Best(struct.PyTreeNode):
       candidate: pytree of the best candidate.
       cost: [] its cost.
       ep_return: [] its return.
-      zero_violation: [] bool; False: no candidate reached zero and this one has the
-        lowest cost.
+      zero_violation: [] bool; False: no candidate that may be picked reached zero,
+        and this one has the lowest cost.
       generation: [] int32 stage in which it was told.
       index: [] int32 its place in that stage.
     """
@@ -107,7 +107,7 @@ def rank(
         return jnp.lexsort((loss, cost))
     is_low = ok & (fitness.ep_return < return_floor)
     cost = jnp.where(is_low, 0.0, cost)
-    return jnp.lexsort((loss, cost, is_low | ~ok, ~ok))
+    return jnp.lexsort((loss, cost, is_low, ~ok))
 
 
 def select(
@@ -221,6 +221,12 @@ def truncation_es(
     size, elites = config.population_size, config.num_elites
     capacity = config.num_stages * size
 
+    def normal(key: Key) -> jax.Array:
+        shape = (size, THETA_SIZE)
+        return config.init_std * jax.random.normal(key, shape, jnp.float32)
+
+    first = start or normal
+
     def init() -> ESState:
         return ESState(
             generation=jnp.zeros((), jnp.int32),
@@ -234,11 +240,6 @@ def truncation_es(
 
     def ask(key: Key, state: ESState) -> jax.Array:
         key_init, key_mutate = jax.random.split(key)
-        if start is None:
-            shape = (size, THETA_SIZE)
-            first = config.init_std * jax.random.normal(key_init, shape, jnp.float32)
-        else:
-            first = start(key_init)
         children = mutate(
             key_mutate,
             state.elites,
@@ -248,7 +249,9 @@ def truncation_es(
             config.mutation_high,
         )
         later = jnp.concatenate([state.elites, children])
-        return jnp.where(state.generation == 0, first, later)
+        return jax.lax.cond(
+            state.generation == 0, lambda: first(key_init), lambda: later
+        )
 
     def tell(key: Key, state: ESState, candidates: jax.Array, fitness: Fitness):
         if config.selection == "paper":
@@ -286,7 +289,7 @@ def best(
     """The final pick: of all zero-violation candidates the one of highest return.
 
     Without any, that of lowest cost; `zero_violation` says which it is. With a
-    `return_floor` both of those that reach it, if any does.
+    `return_floor` either of those that reach it; if none does, the highest return.
     """
     fitness = state.archive_fitness
     index = rank(fitness, zero_tolerance, return_floor)[0]

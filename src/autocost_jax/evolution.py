@@ -393,12 +393,15 @@ def _tracked(metrics: tuple[Metrics, ...]) -> Metrics:
     return {name: jnp.stack([group[name] for group in metrics], 1) for name in TRACKED}
 
 
-def pick_label(config: SearchConfig, is_zero: bool) -> str:
+def pick_label(config: SearchConfig, is_zero: bool, ep_return: float) -> str:
     """In words, by which rule the final pick of a search was made."""
     label = "zero violation, highest return" if is_zero else "lowest cost"
-    if config.return_floor is None:
+    floor = config.return_floor
+    if floor is None:
         return label
-    return f"{label} of those that return at least {config.return_floor:g}, if any"
+    if ep_return < floor:
+        return f"highest return, as none reached {floor:g}"
+    return label if is_zero else f"{label} of those that return at least {floor:g}"
 
 
 def best_of(config: SearchConfig, state: ESState) -> Any:

@@ -27,8 +27,9 @@ def typical_lidars(env: Env, key: Key, num_places: int = 1024) -> jax.Array:
     low_x, low_y, high_x, high_y = env.config.placements_extents
 
     def look(key: Key, place: jax.Array) -> jax.Array:
-        layout = env.reset(key).layout.replace(robot_xy=place)
-        return env.reset_to(layout, key).cost_inputs.constraint_lidar
+        key_reset, key_state = jax.random.split(key)
+        layout = env.reset(key_reset).layout.replace(robot_xy=place)
+        return env.reset_to(layout, key_state).cost_inputs.constraint_lidar
 
     low, high = jnp.array([low_x, low_y]), jnp.array([high_x, high_y])
     places = jax.random.uniform(key_place, (num_places, 2), minval=low, maxval=high)

@@ -338,7 +338,7 @@ def _finish(
     evaluator = make_evaluator(env, agent, num_episodes, watch=watch_first)
     results, episodes = evaluator(states, key)
     card = {
-        "label": pick_label(config, bool(best.zero_violation)),
+        "label": pick_label(config, bool(best.zero_violation), float(best.ep_return)),
         "environment": config.train.env.name,
         "stage": stage,
         "index": int(best.index),

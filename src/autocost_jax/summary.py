@@ -120,7 +120,7 @@ def _best(
         stage=number,
         index=index,
         theta=stage.theta[index],
-        label=pick_label(config, is_zero),
+        label=pick_label(config, is_zero, float(stage.ep_return[index])),
         card=tuple(f"{key}: {card[key]}" for key in shown if key in card),
     )
 

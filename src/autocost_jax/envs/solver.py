@@ -8,7 +8,7 @@ with mass matrix M, unconstrained acceleration a, and for each row of a contact'
 pyramid or of a joint limit its Jacobian J_i, stiffness D_i and reference r_i. So is the
 method, Newton with an exact line search. `mjx.solver.solve` does the same; this one
 exists because that one factors every world's Hessian by a LAPACK call, which on a CPU
-hangs where two of them meet in JAX's thread pool, and because it is many times faster.
+hangs where two of them meet in JAX's thread pool, and because it is much faster.
 
 Worlds are lanes, the last axis of every array here, whatever was vmapped and in which
 order; sums over rows and degrees of freedom are then sums of vectors of worlds, which
@@ -30,6 +30,7 @@ from mujoco import mjx
 
 LINE_SEARCH_STEPS = 5
 ROWS = 8  # rows are filled up to a multiple, so that sums over them can be halved
+FULL_STEP = 1e-3  # how far from 1 the length of a full Newton step may be
 # Lanes that a CPU solves together: a few vectors of its, and their rows fit its cache.
 CPU_LANES = 32
 
@@ -141,8 +142,8 @@ def _in_blocks(function: Callable[[Problem], Any], problem: Problem) -> Any:
 def minimise(problem: Problem, iterations: int) -> tuple[jax.Array, ...]:
     """Newton's method in every lane, from the better of two starts.
 
-    A lane is done when a step leaves its set of pushing rows as it was: along such a
-    step the function is one quadratic, of which the step has reached the minimum.
+    A lane is done when a full step leaves its set of pushing rows as it was: along such
+    a step the function is one quadratic, of which the step has reached the minimum.
 
     Args:
       problem: fields [..., W].
@@ -177,7 +178,8 @@ def minimise(problem: Problem, iterations: int) -> tuple[jax.Array, ...]:
         moved = jnp.where(is_done, x, x + length * direction)
         reached = gap(moved)
         is_same = ((reached < 0) == (distance < 0)).all(0)
-        return count + 1, moved, reached, is_done | is_same
+        is_full = jnp.abs(length - 1) < FULL_STEP
+        return count + 1, moved, reached, is_done | (is_same & is_full)
 
     x = jnp.where(cost(start) < cost(smooth), start, smooth)
     carry = (jnp.zeros((), jnp.int32), x, gap(x), jnp.zeros(x.shape[-1:], bool))
