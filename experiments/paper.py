@@ -55,6 +55,7 @@ class Design(NamedTuple):
 
 COSTS = RESULTS / "reduced" / "costs"
 WITH_NETWORK = "extrinsic+intrinsic"
+EVOLVED = "ic4srl_reduced"  # until a search of full scale finds the paper's IC4SRL
 DESIGNS: dict[str, Design] = {
     "unconstrained": Design("", algorithms=("ppo",)),
     "extrinsic": Design("limit 0"),
@@ -67,8 +68,8 @@ DESIGNS: dict[str, Design] = {
     "margin_2x": Design("margin 2x", "safety_margin_2x"),
     "margin_3x": Design("margin 3x", "safety_margin_3x"),
     "steep": Design("steep network", WITH_NETWORK, theta=COSTS / "steep"),
-    "evolved": Design("evolved", WITH_NETWORK, theta="ic4srl"),
-    "evolved_alone": Design("evolved, w/o extrinsic", "intrinsic", theta="ic4srl"),
+    "evolved": Design("evolved", WITH_NETWORK, theta=EVOLVED),
+    "evolved_alone": Design("evolved, w/o extrinsic", "intrinsic", theta=EVOLVED),
 }
 
 

@@ -153,12 +153,15 @@ def validated(runs: Path) -> list[dict[str, Any]]:
 
 
 def ship(args: argparse.Namespace) -> None:
-    """Write the winner and the runners-up: COSTS, and the winner into the package."""
+    """Write the winner and the runners-up: COSTS, and the winner into the package.
+
+    Its name says that the search was of reduced scale.
+    """
     where = args.results / "costs" if args.smoke else COSTS
     where.mkdir(parents=True, exist_ok=True)
     for place, row in enumerate(validated(args.runs)):
         config, facts = read_config(folder(args.runs, row["rule"], row["seed"]))
-        name = "ic4srl" if place == 0 else f"runner_up_{place}"
+        name = paper.EVOLVED if place == 0 else f"runner_up_{place}"
         card = make_card(row, config) | {"commit": facts["commit"]}
         save_cost(where / name, row["theta"], to_json(card))
         if place == 0 and not args.smoke:
@@ -315,7 +318,7 @@ def draw_heat_map(args: argparse.Namespace) -> None:
     """The shipped cost around one hazard, as in the paper."""
     from autocost_jax.report_assets.figures import heat_map
 
-    winner = (args.results / "costs" if args.smoke else COSTS) / "ic4srl"
+    winner = (args.results / "costs" if args.smoke else COSTS) / paper.EVOLVED
     if winner.with_suffix(".npz").exists():
         picture = heat_map(np.asarray(load_cost(winner)), radius=0.3)
         picture.savefig(args.results / "heat_map.png", dpi=130)

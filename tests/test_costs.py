@@ -191,7 +191,7 @@ def test_round_trip(tmp_path, name):
 
 
 def test_costs_of_the_package_load_by_name(tmp_path, monkeypatch):
-    assert "ic4srl" in list_costs()
+    assert "ic4srl_reduced" in list_costs()
     for name in list_costs():
         theta = load_cost(name)
         assert theta.shape == (41,)
@@ -200,11 +200,11 @@ def test_costs_of_the_package_load_by_name(tmp_path, monkeypatch):
         assert {"found", "budget", "validation", "fails"} <= set(card)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match="a cost of the package"):
-        save_cost("ic4srl", np.ones(41), {})
-    save_cost("./ic4srl", np.ones(41), {})
-    assert sorted(os.listdir(tmp_path)) == ["ic4srl.json", "ic4srl.npz"]
-    assert not bool((load_cost("ic4srl") == 1).all())
-    assert bool((load_cost("./ic4srl.npz") == 1).all())
+        save_cost("ic4srl_reduced", np.ones(41), {})
+    save_cost("./ic4srl_reduced", np.ones(41), {})
+    assert sorted(os.listdir(tmp_path)) == ["ic4srl_reduced.json", "ic4srl_reduced.npz"]
+    assert not bool((load_cost("ic4srl_reduced") == 1).all())
+    assert bool((load_cost("./ic4srl_reduced.npz") == 1).all())
 
 
 def test_a_missing_card_is_named(tmp_path):

@@ -189,10 +189,10 @@ def test_the_shipped_cost_is_the_best_useful_finalist(tmp_path):
     write_validation(runs, [worst, best, [(9.0, 4.0, 60)] * 2, [(9.0, 3.0, 50)] * 2])
     args = argparse.Namespace(runs=runs, results=tmp_path, smoke=True, scale="smoke")
     searches.ship(args)
-    shipped = load_cost(tmp_path / "costs" / "ic4srl")
+    shipped = load_cost(tmp_path / "costs" / "ic4srl_reduced")
     np.testing.assert_array_equal(shipped, found[1]["theta"])
     np.testing.assert_array_equal(found[1]["theta"], theta[1, 1])
-    card = cost_card(tmp_path / "costs" / "ic4srl")
+    card = cost_card(tmp_path / "costs" / "ic4srl_reduced")
     assert card["fails"] == "not free of violations under PPO-Lag"
     assert card["validation"]["cpo"]["violation_rate_upper"] > 0
     assert len(list((tmp_path / "costs").glob("runner_up_*.npz"))) == 3
