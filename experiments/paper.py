@@ -329,7 +329,7 @@ AXES = {
 
 
 def draw(figure: Figure, result: dict[str, Any], file: Path) -> None:
-    """Learning curves: a column a world, a row a curve; bands from seed to seed."""
+    """Learning curves, means of 5 epochs; a column a world, bands over the seeds."""
     from matplotlib.figure import Figure as Picture
 
     worlds, rows = list(result["worlds"]), figure.curves
@@ -365,7 +365,8 @@ def draw(figure: Figure, result: dict[str, Any], file: Path) -> None:
             for panel in axes[index]:
                 panel.set_yscale("symlog", linthresh=0.1)
                 panel.axhline(0, color="r", linewidth=0.8)
-    axes[0, 0].legend(fontsize=6)
+    lines, names = axes[0, 0].get_legend_handles_labels()
+    picture.legend(lines, names, fontsize=6, ncols=3, loc="outside lower center")
     picture.suptitle(figure.title, fontsize=9)
     picture.savefig(file, dpi=130)
 
