@@ -303,6 +303,7 @@ def draw(result: dict[str, Any], file: Path) -> None:
         axes[0, column].set_yscale("symlog", linthresh=0.1)
         axes[0, column].axhline(0, color="r", linewidth=0.8)
         axes[1, column].set_xlabel("stage")
+        axes[1, column].set_xticks(range(1, 1 + max(len(s["cost"]) for s in own)))
     axes[0, 0].set_ylabel("extrinsic cost an episode")
     axes[1, 0].set_ylabel("return an episode")
     axes[0, 0].legend(fontsize=6)
