@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from autocost_jax.arrays import flatten, unflatten
+from autocost_jax.arrays import flatten, stored_like, unflatten
 
 AUTO = "auto"
 
@@ -92,7 +92,11 @@ def share(tree: Any, template: Any) -> Any:
     is_there = multihost_utils.broadcast_one_to_all(np.asarray(tree is not None))
     if not bool(is_there):
         return None
-    arrays = flatten(template if tree is None else tree)
+    if tree is None:  # the values do not matter, and those of others cannot be read
+        like = stored_like(template)
+        arrays = {name: np.zeros(x.shape, x.dtype) for name, x in like.items()}
+    else:
+        arrays = flatten(tree)
     arrays = multihost_utils.broadcast_one_to_all(arrays)
     return unflatten(jax.tree.map(np.asarray, arrays), template)
 

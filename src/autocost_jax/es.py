@@ -8,6 +8,7 @@ Source: He, Zhao & Liu 2023, "AutoCost". Ours where the paper is silent: see
 the elites in rank order, and elites are kept in front of the children.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -206,6 +207,11 @@ def monotone_start(key: Key, num: int, std: float, lidars: jax.Array) -> jax.Arr
     return theta.at[:, -1].set(quiet)
 
 
+def _normal_start(config: SearchConfig, key: Key) -> jax.Array:
+    shape = (config.population_size, THETA_SIZE)
+    return config.init_std * jax.random.normal(key, shape, jnp.float32)
+
+
 def truncation_es(
     config: SearchConfig, start: Callable[[Key], jax.Array] | None = None
 ) -> ES:
@@ -221,11 +227,7 @@ def truncation_es(
     size, elites = config.population_size, config.num_elites
     capacity = config.num_stages * size
 
-    def normal(key: Key) -> jax.Array:
-        shape = (size, THETA_SIZE)
-        return config.init_std * jax.random.normal(key, shape, jnp.float32)
-
-    first = start or normal
+    first = start or functools.partial(_normal_start, config)
 
     def init() -> ESState:
         return ESState(
