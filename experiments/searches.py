@@ -17,9 +17,11 @@ import dataclasses
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import paper
 from common import run_if_needed
@@ -80,7 +82,6 @@ def finalists(runs: Path) -> list[dict[str, Any]]:
     does not carry it.
     """
     found: dict[bytes, list[dict[str, Any]]] = {}
-    floor = float(RULES["guided"][-1])
     for rule, seed, path in finished(runs):
         for stage, file in list_stages(path).items():
             arrays = load_arrays(file)
@@ -98,11 +99,17 @@ def finalists(runs: Path) -> list[dict[str, Any]]:
         }
         for group in found.values()
     ]
-    fitness = Fitness(
-        cost=np.array([row["cost"] for row in rows]),  # type: ignore[arg-type]
-        ep_return=np.array([row["ep_return"] for row in rows]),  # type: ignore[arg-type]
+    order = guided_order(
+        [row["cost"] for row in rows], [row["ep_return"] for row in rows]
     )
-    return [rows[int(i)] for i in rank(fitness, return_floor=floor)[:FINALISTS]]
+    return [rows[i] for i in order[:FINALISTS]]
+
+
+def guided_order(costs: Sequence[float], returns: Sequence[float]) -> list[int]:
+    """Indices, best first, as the guided search ranks."""
+    fitness = Fitness(jnp.asarray(costs), jnp.asarray(returns))
+    floor = float(RULES["guided"][-1])
+    return [int(i) for i in rank(fitness, return_floor=floor)]
 
 
 def validate(args: argparse.Namespace) -> None:
@@ -122,10 +129,9 @@ def validate(args: argparse.Namespace) -> None:
 
 
 def validated(runs: Path) -> list[dict[str, Any]]:
-    """The finalists with their scores on fresh seeds, best first.
+    """The finalists with their scores on fresh seeds, best first in those scores.
 
-    By the paper's rule on the validation: fewest violations of both algorithms, here
-    the lowest extrinsic cost among those whose return reaches the floor.
+    Means over both algorithms, ranked as the guided search ranks.
     """
     path = runs / "validation"
     config = read_config(path, TableConfig)[0]
@@ -143,13 +149,13 @@ def validated(runs: Path) -> list[dict[str, Any]]:
         }
         result.append(row | {"validation": scores})
 
-    def order(row: dict[str, Any]) -> tuple[bool, float, float]:
-        scores = row["validation"].values()
-        cost = float(np.mean([score["cost"]["mean"] for score in scores]))
-        gain = float(np.mean([score["return"]["mean"] for score in scores]))
-        return gain < float(RULES["guided"][-1]), cost, -gain
+    def means(key: str) -> list[float]:
+        return [
+            float(np.mean([score[key]["mean"] for score in row["validation"].values()]))
+            for row in result
+        ]
 
-    return sorted(result, key=order)
+    return [result[i] for i in guided_order(means("cost"), means("return"))]
 
 
 def ship(args: argparse.Namespace) -> None:

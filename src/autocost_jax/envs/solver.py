@@ -8,7 +8,7 @@ with mass matrix M, unconstrained acceleration a, and for each row of a contact'
 pyramid or of a joint limit its Jacobian J_i, stiffness D_i and reference r_i. So is the
 method, Newton with an exact line search. `mjx.solver.solve` does the same; this one
 exists because that one factors every world's Hessian by a LAPACK call, which on a CPU
-hangs where two of them meet in JAX's thread pool, and because it is much faster.
+hangs where two of them meet in JAX's thread pool, and because it is a few times faster.
 
 Worlds are lanes, the last axis of every array here, whatever was vmapped and in which
 order; sums over rows and degrees of freedom are then sums of vectors of worlds, which
