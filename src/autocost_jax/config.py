@@ -172,10 +172,11 @@ class SearchConfig:
     a mean extrinsic cost <= `zero_tolerance` over those episodes.
     `selection="random"` replaces the ranking by a random choice: the control.
 
-    Two options of ours beside the paper's rule. `start="monotone"` draws first costs
+    Three options of ours beside the paper's rule. `start="monotone"` draws first costs
     that rise as anything comes nearer and are small at a typical place, see
-    `es.monotone_start`. With a `return_floor` a candidate of a lower return ranks
-    behind all others, however safe it is, see `es.rank`.
+    `es.monotone_start`. With `keep_level` a mutation leaves the cost of a typical place
+    about as it is, see `es.keep_level`. With a `return_floor` a candidate of a lower
+    return ranks behind all others, however safe it is, see `es.rank`.
     """
 
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -193,6 +194,7 @@ class SearchConfig:
     zero_tolerance: float = 0.0
     selection: Selection = "paper"
     start: Start = "normal"
+    keep_level: bool = False
     return_floor: float | None = None
 
     def __post_init__(self) -> None:

@@ -207,13 +207,46 @@ def monotone_start(key: Key, num: int, std: float, lidars: jax.Array) -> jax.Arr
     return theta.at[:, -1].set(quiet)
 
 
+def keep_level(
+    key: Key, elites: jax.Array, children: jax.Array, lidars: jax.Array, std: float
+) -> jax.Array:
+    """Children that are about as loud at a typical place as their parents were.
+
+    A mutation of the weights shifts the cost of every place by orders of magnitude, so
+    that a child of a good cost is mostly silent or shouts everywhere. Here the output
+    bias takes that back: a child's median odds over `lidars` are its parent's, times
+    exp(N(0, std^2)). Ours, not the paper's.
+
+    Args:
+      key: consumed.
+      elites: theta [E, 41].
+      children: theta [C, 41], dealt round-robin as by `mutate`.
+      lidars: [M, 8] readings at typical places.
+      std: deviation of the logarithm.
+
+    Returns:
+      theta [C, 41].
+    """
+
+    def level(theta: jax.Array) -> jax.Array:
+        return jnp.median(intrinsic_logit(theta, lidars))
+
+    size = children.shape[0]
+    parents = elites[jnp.arange(size) % elites.shape[0]]
+    noise = std * jax.random.normal(key, (size,), children.dtype)
+    shift = jax.vmap(level)(parents) - jax.vmap(level)(children) + noise
+    return children.at[:, -1].add(shift)
+
+
 def _normal_start(config: SearchConfig, key: Key) -> jax.Array:
     shape = (config.population_size, THETA_SIZE)
     return config.init_std * jax.random.normal(key, shape, jnp.float32)
 
 
 def truncation_es(
-    config: SearchConfig, start: Callable[[Key], jax.Array] | None = None
+    config: SearchConfig,
+    start: Callable[[Key], jax.Array] | None = None,
+    adjust: Callable[[Key, jax.Array, jax.Array], jax.Array] | None = None,
 ) -> ES:
     """The paper's search over theta [41]: keep the best, mutate, repeat.
 
@@ -223,6 +256,7 @@ def truncation_es(
     Args:
       config: the search.
       start: key -> first candidates [P, 41]; default: N(0, `config.init_std`^2).
+      adjust: (key, elites, children) -> the children to train, such as `keep_level`.
     """
     size, elites = config.population_size, config.num_elites
     capacity = config.num_stages * size
@@ -242,6 +276,7 @@ def truncation_es(
 
     def ask(key: Key, state: ESState) -> jax.Array:
         key_init, key_mutate = jax.random.split(key)
+        key_adjust = jax.random.fold_in(key, 2)  # the paper's search stays as it was
         children = mutate(
             key_mutate,
             state.elites,
@@ -250,6 +285,8 @@ def truncation_es(
             config.mutation_low,
             config.mutation_high,
         )
+        if adjust is not None:
+            children = adjust(key_adjust, state.elites, children)
         later = jnp.concatenate([state.elites, children])
         return jax.lax.cond(
             state.generation == 0, lambda: first(key_init), lambda: later

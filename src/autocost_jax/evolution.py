@@ -17,7 +17,7 @@ from autocost_jax import es as es_lib
 from autocost_jax.config import SearchConfig
 from autocost_jax.costs import BANK, CostTerm, training_cost
 from autocost_jax.envs.env import make_env
-from autocost_jax.es import ESState, Fitness, truncation_es
+from autocost_jax.es import ES, ESState, Fitness, truncation_es
 from autocost_jax.population import (
     Population,
     candidate_slots,
@@ -209,7 +209,7 @@ def stage_functions(
     config: SearchConfig, root: Key, bank: Sequence[CostTerm] = BANK
 ) -> StageFunctions:
     """The functions around the chunks of a search."""
-    strategy = truncation_es(config, _start(config))
+    strategy = _strategy(config)
 
     def begin(state: ESState, stage: jax.Array | int):
         candidates = strategy.ask(stage_key(root, stage, ASK), state)
@@ -240,19 +240,28 @@ def stage_functions(
     return StageFunctions(strategy.init, begin, slots, record, end)
 
 
-def _start(config: SearchConfig) -> Callable[[Key], jax.Array] | None:
-    """How the first candidates are drawn; None for the strategy's own way."""
-    if config.start == "normal":
-        return None
+def _strategy(config: SearchConfig) -> ES:
+    """The strategy with the options that look at the world's typical places."""
+    if config.start == "normal" and not config.keep_level:
+        return truncation_es(config)
     env = make_env(config.train.env)
 
-    def start(key: Key) -> jax.Array:
-        lidars = typical_lidars(env, jax.random.key(0))
-        return es_lib.monotone_start(
-            key, config.population_size, config.init_std, lidars
-        )
+    def lidars() -> jax.Array:
+        return typical_lidars(env, jax.random.key(0))
 
-    return start
+    def start(key: Key) -> jax.Array:
+        size, std = config.population_size, config.init_std
+        return es_lib.monotone_start(key, size, std, lidars())
+
+    def adjust(key: Key, elites: jax.Array, children: jax.Array) -> jax.Array:
+        std = config.mutation_std
+        return es_lib.keep_level(key, elites, children, lidars(), std)
+
+    return truncation_es(
+        config,
+        start if config.start == "monotone" else None,
+        adjust if config.keep_level else None,
+    )
 
 
 def search(

@@ -1,13 +1,20 @@
 """The constraint solver: the minimum, in every lane, whatever is beside it."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from autocost_jax.envs import solver
-from autocost_jax.envs.solver import CPU_LANES, Problem, minimise, solve_positive
+from autocost_jax.envs.solver import (
+    CPU_LANES,
+    Problem,
+    minimise,
+    over_lanes,
+    solve_positive,
+)
 
 NV, ROWS, ITERATIONS = 7, 24, 12
 
@@ -42,9 +49,11 @@ def solve(batch: Problem) -> np.ndarray:
 
 
 def one(problem: Problem) -> jax.Array:
-    """x [nv] of one world, as `solve_constraints` asks for it."""
+    """x [nv] of one world, as the physics asks for it."""
     lane = jax.tree.map(lambda x: x[..., None], problem)
-    return solver._solver(ITERATIONS)(lane)[0][..., 0]
+    return over_lanes(functools.partial(minimise, iterations=ITERATIONS))(lane)[0][
+        ..., 0
+    ]
 
 
 def cost(p: Problem, x: np.ndarray) -> float:

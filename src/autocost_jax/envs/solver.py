@@ -28,11 +28,29 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from mujoco import mjx
 
+from autocost_jax.envs.rows import EDGES, Inputs, build, inputs, make_rows
+
 LINE_SEARCH_STEPS = 5
 ROWS = 8  # rows are filled up to a multiple, so that sums over them can be halved
 FULL_STEP = 1e-3  # how far from 1 the length of a full Newton step may be
 # Lanes that a CPU solves together: a few vectors of its, and their rows fit its cache.
 CPU_LANES = 32
+
+
+class State(NamedTuple):
+    """What the minimisation needs beside the rows, in W worlds.
+
+    Attributes:
+      mass: [nv, nv, W] M.
+      smooth: [nv, W] a.
+      force: [nv, W] M a.
+      start: [nv, W] where to begin, if that is better than a.
+    """
+
+    mass: jax.Array
+    smooth: jax.Array
+    force: jax.Array
+    start: jax.Array
 
 
 class Problem(NamedTuple):
@@ -57,74 +75,99 @@ class Problem(NamedTuple):
     start: jax.Array
 
 
-def solve_constraints(model: mjx.Model, data: mjx.Data, iterations: int) -> mjx.Data:
-    """The acceleration under constraints, and the constraints' forces.
+def make_solver(
+    mj_model: Any, data: mjx.Data
+) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
+    """The solver of a `mujoco.MjModel`, as a function (model, data) -> data.
+
+    It takes data after `mjx.fwd_acceleration` and sets the acceleration `qacc` [nv],
+    `qfrc_constraint` [nv] and `_impl.efc_force` [nefc].
 
     Args:
-      model: pyramidal cones, no equalities, no friction loss.
-      data: `mjx.fwd_acceleration` has been called.
-      iterations: Newton steps at most.
+      mj_model: see `rows.make_rows` for what it may contain.
+      data: any of its data, for shapes and the kinds of contacts.
 
-    Returns:
-      data with `qacc` [nv], `qfrc_constraint` [nv] and `_impl.efc_force` [nefc].
+    Raises:
+      ValueError: the model needs rows of another kind.
     """
-    impl: Any = data._impl
-    count = impl.efc_D.shape[0]
-    spare = -count % ROWS
-    problem = Problem(
-        jacobian=jnp.pad(impl.efc_J.T, ((0, 0), (0, spare))),
-        stiffness=jnp.pad(impl.efc_D, (0, spare)),
-        reference=jnp.pad(impl.efc_aref, (0, spare)),
-        mass=mjx.full_m(model, data),
-        smooth=data.qacc_smooth,
-        force=data.qfrc_smooth,
-        start=data.qacc_warmstart,
+    rows = make_rows(mj_model, data)
+    impratio, iterations = float(mj_model.opt.impratio), int(mj_model.opt.iterations)
+
+    def solve_lanes(given: Inputs, state: State) -> tuple[jax.Array, ...]:
+        problem = make_problem(*build(rows, impratio, given), state)
+        qacc, force, push = minimise(problem, iterations)
+        count = EDGES * len(given.depth) + len(given.limited)
+        return qacc, force[:count], push
+
+    solve = over_lanes(solve_lanes)
+
+    def solve_constraints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        state = State(
+            mass=mjx.full_m(model, data),
+            smooth=data.qacc_smooth,
+            force=data.qfrc_smooth,
+            start=data.qacc_warmstart,
+        )
+        lanes = jax.tree.map(lambda x: x[..., None], (inputs(rows, data), state))
+        qacc, force, push = (x[..., 0] for x in solve(*lanes))
+        solved: Any = {
+            "qacc": qacc,
+            "qfrc_constraint": push,
+            "_impl.efc_force": force,
+        }
+        result: Any = data.tree_replace(solved)
+        return result
+
+    return solve_constraints
+
+
+def make_problem(
+    jacobian: jax.Array, stiffness: jax.Array, reference: jax.Array, state: State
+) -> Problem:
+    """The minimisation; rows are filled up so that sums over them can be halved."""
+    spare = -len(stiffness) % ROWS
+    fill = ((0, spare), (0, 0))
+    return Problem(
+        jacobian=jnp.pad(jacobian, ((0, 0), *fill)),
+        stiffness=jnp.pad(stiffness, fill),
+        reference=jnp.pad(reference, fill),
+        **state._asdict(),
     )
-    lanes = jax.tree.map(lambda x: x[..., None], problem)
-    qacc, force, push = (x[..., 0] for x in _solver(iterations)(lanes))
-    solved: Any = {
-        "qacc": qacc,
-        "qfrc_constraint": push,
-        "_impl.efc_force": force[:count],
-    }
-    result: Any = data.tree_replace(solved)
-    return result
 
 
-@functools.cache
-def _solver(iterations: int) -> Callable[[Problem], tuple[jax.Array, ...]]:
-    """Problem [..., W] -> x [nv, W], the rows' forces [n, W] and their push [nv, W].
+def over_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of arrays [..., W] whose lanes every `vmap` joins.
 
-    Under `vmap` the new axis joins the lanes.
+    On a CPU it sees `CPU_LANES` of them at a time.
     """
 
     @custom_vmap
-    def solve(problem: Problem) -> tuple[jax.Array, ...]:
-        return _in_blocks(functools.partial(minimise, iterations=iterations), problem)
+    def call(*arguments: Any) -> Any:
+        return _in_blocks(function, arguments)
 
-    @solve.def_vmap
-    def _(size: int, is_batched: Any, problem: Problem):
+    @call.def_vmap
+    def _(size: int, is_batched: Any, *arguments: Any):
         def join(x: jax.Array, is_batched: bool) -> jax.Array:
             if not is_batched:
                 x = jnp.broadcast_to(x, (size, *x.shape))
             x = jnp.moveaxis(x, 0, -2)
-            return x.reshape(*x.shape[:-2], -1)
+            return x.reshape(*x.shape[:-2], size * x.shape[-1])
 
         def split(x: jax.Array) -> jax.Array:
-            return jnp.moveaxis(x.reshape(*x.shape[:-1], size, -1), -2, 0)
+            shape = (*x.shape[:-1], size, x.shape[-1] // size)
+            return jnp.moveaxis(x.reshape(shape), -2, 0)
 
-        (batched,) = is_batched
-        solved = solve(jax.tree.map(join, problem, batched))
-        return jax.tree.map(split, solved), jax.tree.map(lambda _: True, solved)
+        result = call(*jax.tree.map(join, arguments, tuple(is_batched)))
+        return jax.tree.map(split, result), jax.tree.map(lambda _: True, result)
 
-    return solve
+    return call
 
 
-def _in_blocks(function: Callable[[Problem], Any], problem: Problem) -> Any:
+def _in_blocks(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     """`function` of all lanes; on a CPU of `CPU_LANES` at a time."""
-    lanes = problem.start.shape[-1]
+    lanes = jax.tree.leaves(arguments)[0].shape[-1]
     if jax.default_backend() != "cpu" or lanes <= CPU_LANES:
-        return function(problem)
+        return function(*arguments)
     blocks = -(-lanes // CPU_LANES)
 
     def cut(x: jax.Array) -> jax.Array:
@@ -136,7 +179,9 @@ def _in_blocks(function: Callable[[Problem], Any], problem: Problem) -> Any:
         x = jnp.moveaxis(x, 0, -2)
         return x.reshape(*x.shape[:-2], -1)[..., :lanes]
 
-    return jax.tree.map(join, jax.lax.map(function, jax.tree.map(cut, problem)))
+    cut_arguments = jax.tree.map(cut, arguments)
+    result = jax.lax.map(lambda block: function(*block), cut_arguments)
+    return jax.tree.map(join, result)
 
 
 def minimise(problem: Problem, iterations: int) -> tuple[jax.Array, ...]:

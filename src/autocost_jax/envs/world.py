@@ -15,10 +15,11 @@ from mujoco import mjx
 
 from autocost_jax.env_config import EnvConfig
 from autocost_jax.envs.models import PhysicsModel, mujoco, physics_model
-from autocost_jax.envs.solver import solve_constraints
+from autocost_jax.envs.solver import make_solver
 from autocost_jax.records import Bodies, Layout, PhysicsState
 
 Moving = tuple[jax.Array, jax.Array, jax.Array]  # qpos, qvel, qacc_warmstart
+Forward = Callable[[mjx.Model, mjx.Data], mjx.Data]
 
 
 class World(NamedTuple):
@@ -47,11 +48,12 @@ class World(NamedTuple):
 
 
 class _Scene(NamedTuple):
-    """A model on the device, and where its parts are in the arrays."""
+    """A model on the device, its dynamics, and where its parts are in the arrays."""
 
     physics: PhysicsModel
     model: mjx.Model
     rest: mjx.Data
+    forward: Forward
     box: int | None
     vases: tuple[int, ...]
 
@@ -67,11 +69,12 @@ def make_world(config: EnvConfig) -> World:
         physics=physics,
         model=model,
         rest=rest,
+        forward=_make_forward(physics, rest),
         box=mj_model.body("box").id if config.task == "Push" else None,
         vases=tuple(mj_model.body(f"vase{i}").id for i in range(config.vases_num)),
     )
     num_substeps = config.frameskip_binom_n
-    substep = functools.partial(_contact_substep, physics.choices)
+    substep = functools.partial(_contact_substep, scene.forward)
     if not physics.has_contacts:
         substep = _free_substep
 
@@ -213,18 +216,10 @@ def _mocap_positions(scene: _Scene, layout: Layout, qpos: jax.Array) -> jax.Arra
 def _observe(
     scene: _Scene, start: mjx.Data, moving: Moving, time: jax.Array
 ) -> PhysicsState:
-    """The state that `moving` is, its sensors and contacts evaluated.
-
-    `mjx.forward` skips the accelerometer where a model has no constraint at all, so
-    that stage is called here.
-    """
-    model = scene.model
+    """The state that `moving` is, its sensors and contacts evaluated."""
     qpos, qvel, warmstart = moving
     data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-    if scene.physics.has_contacts:
-        data = _forward(scene.physics.choices, model, data)
-    else:
-        data = mjx.sensor_acc(model, mjx.forward(model, data))
+    data = scene.forward(scene.model, data)
     return PhysicsState(
         qpos=qpos,
         qvel=qvel,
@@ -325,26 +320,34 @@ def _free_substep(model: mjx.Model, start: mjx.Data, moving: Moving) -> Moving:
 
 
 def _contact_substep(
-    choices: np.ndarray, model: mjx.Model, start: mjx.Data, moving: Moving
+    forward: Forward, model: mjx.Model, start: mjx.Data, moving: Moving
 ) -> Moving:
     """One physics step with contacts; what is not carried on is never computed."""
     qpos, qvel, warmstart = moving
     data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-    data = mjx.euler(model, _forward(choices, model, data))
+    data = mjx.euler(model, forward(model, data))
     return data.qpos, data.qvel, data.qacc_warmstart
 
 
-def _forward(choices: np.ndarray, model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def _make_forward(physics: PhysicsModel, rest: mjx.Data) -> Forward:
     """`mjx.forward` with MuJoCo's contact frames and this package's solver."""
-    data = mjx.com_pos(model, mjx.kinematics(model, data))
-    data = mjx.factor_m(model, mjx.crb(model, data))
-    data = _align_frames(model, mjx.collision(model, data))
-    data = _keep_deepest(choices, data) if choices.any() else data
-    data = mjx.transmission(model, mjx.make_constraint(model, data))
-    data = mjx.sensor_vel(model, mjx.fwd_velocity(model, mjx.sensor_pos(model, data)))
-    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-    data = solve_constraints(model, data, int(model.opt.iterations))
-    return mjx.sensor_acc(model, data)
+    if not physics.has_contacts:
+        # `mjx.forward` skips the accelerometer where there is no constraint at all.
+        return lambda model, data: mjx.sensor_acc(model, mjx.forward(model, data))
+    solve = make_solver(physics.mj_model, rest)
+    choices = physics.choices
+
+    def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        data = mjx.com_pos(model, mjx.kinematics(model, data))
+        data = mjx.factor_m(model, mjx.crb(model, data))
+        data = _align_frames(model, mjx.collision(model, data))
+        data = _keep_deepest(choices, data) if choices.any() else data
+        data = mjx.sensor_pos(model, mjx.transmission(model, data))
+        data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
+        data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+        return mjx.sensor_acc(model, solve(model, data))
+
+    return forward
 
 
 def _align_frames(model: mjx.Model, data: mjx.Data) -> mjx.Data:
