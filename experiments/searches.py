@@ -5,11 +5,13 @@
     python experiments/searches.py ship      # the winner into the package, with a card
     python experiments/searches.py collect   # JSON, table, pictures of what has run
 
-Both rules have the same budget, learners and mutations, and meet the same layouts.
-"paper" starts from N(0, 5^2) and selects as the paper does; "guided" starts from costs
-that rise as anything comes nearer (`es.monotone_start`, std 8) and ranks candidates
-that return less than 2 an episode behind all others (`es.rank`). Reduced scale: 12
-candidates, 4 stages, 512,000 steps a slot; 3 search seeds. `--smoke` is for tests.
+All rules have the same budget and learners, and meet the same layouts. "paper" starts
+from N(0, 5^2) and selects and mutates as the paper does. "guided" starts from costs
+that rise as anything comes nearer (`es.monotone_start`, std 8), ranks candidates that
+return less than 2 an episode behind all others (`es.rank`), and lets no mutation change
+how loud a cost is at a typical place (`es.keep_level`). "raw" is guided with the
+paper's mutations. Reduced scale: 12 candidates, 4 stages, 512,000 steps a slot; 3
+search seeds, 1 for raw. `--smoke` is for tests.
 """
 
 import argparse
@@ -33,11 +35,10 @@ from autocost_jax.methods import Method, TableConfig
 from autocost_jax.rundata import to_json
 from autocost_jax.store import list_stages, read_config, run_facts
 
-RULES = {
-    "paper": (),
-    "guided": ("--start", "monotone", "--init-std", "8", "--return-floor", "2"),
-}
-SEEDS = (0, 1, 2)
+FLOOR = "2"
+START = ("--start", "monotone", "--init-std", "8", "--return-floor", FLOOR)
+RULES = {"guided": (*START, "--keep-level"), "paper": (), "raw": START}
+SEEDS = {"guided": (0, 1, 2), "paper": (0, 1, 2), "raw": (0,)}
 SIZE = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "12")
 SIZE += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
 SIZE += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
@@ -55,8 +56,8 @@ def folder(runs: Path, rule: str, seed: int) -> Path:
 
 def run(args: argparse.Namespace) -> None:
     """Each search as a user starts it; finished ones are kept, others continued."""
-    for seed in SEEDS[:1] if args.smoke else SEEDS:
-        for rule, flags in RULES.items():
+    for rule, flags in RULES.items():
+        for seed in SEEDS[rule][:1] if args.smoke else SEEDS[rule]:
             out = folder(args.runs, rule, seed)
             if (out / "report" / "index.html").exists():
                 continue
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace) -> None:
 
 def finished(runs: Path) -> list[tuple[str, int, Path]]:
     """Rule, seed and directory of each finished search."""
-    known = [(rule, seed) for rule in RULES for seed in SEEDS]
+    known = [(rule, seed) for rule in RULES for seed in SEEDS[rule]]
     paths = [(rule, seed, folder(runs, rule, seed)) for rule, seed in known]
     return [row for row in paths if (row[2] / "cost.json").exists()]
 
@@ -108,8 +109,7 @@ def finalists(runs: Path) -> list[dict[str, Any]]:
 def guided_order(costs: Sequence[float], returns: Sequence[float]) -> list[int]:
     """Indices, best first, as the guided search ranks."""
     fitness = Fitness(jnp.asarray(costs), jnp.asarray(returns))
-    floor = float(RULES["guided"][-1])
-    return [int(i) for i in rank(fitness, return_floor=floor)]
+    return [int(i) for i in rank(fitness, return_floor=float(FLOOR))]
 
 
 def validate(args: argparse.Namespace) -> None:
