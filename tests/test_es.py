@@ -7,19 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from autocost_jax import make_env, preset
 from autocost_jax.config import SearchConfig
-from autocost_jax.costs import intrinsic_cost
+from autocost_jax.costs import intrinsic_cost, intrinsic_logit
 from autocost_jax.es import (
     QUIET_COST,
     Fitness,
     best,
+    keep_level,
     monotone_start,
     mutate,
     rank,
     select,
     truncation_es,
 )
+from autocost_jax.evolution import _strategy
 from autocost_jax.population import jit_bundle
+from autocost_jax.rollout import typical_lidars
 
 SIGMAS = 5.0  # of the estimate: a fixed key passes or fails for good
 SMALL = SearchConfig(population_size=6, num_elites=2, num_stages=3)
@@ -151,6 +155,53 @@ def test_a_monotone_start_never_falls_as_something_comes_nearer(key):
     typical = jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta)
     middle = np.median(np.asarray(typical), axis=1)
     np.testing.assert_allclose(middle, QUIET_COST, rtol=0.05)
+
+
+def test_children_stay_as_loud_as_their_parents(key):
+    places, std = lidars_of(1.0), 0.5
+    keys = jax.random.split(key, 3)
+    elites = monotone_start(keys[0], 3, 8.0, places)
+    elites = elites.at[:, -1].add(jnp.array([-2.0, 0.0, 2.0]))
+    children = mutate(keys[1], elites, 300)
+
+    def levels(theta):
+        logits = jax.vmap(lambda theta: intrinsic_logit(theta, places))(theta)
+        return np.median(np.asarray(logits), axis=1)
+
+    kept = keep_level(keys[2], elites, children, places, std)
+    np.testing.assert_array_equal(kept[:, :-1], children[:, :-1])
+    parents = np.tile(levels(elites), 100)
+    assert np.std(levels(children) - parents) > 3  # what the paper's mutations do
+    shift = (levels(kept) - parents).reshape(100, 3)
+    assert np.abs(shift.mean(0)).max() < SIGMAS * std / 10
+    np.testing.assert_allclose(shift.std(), std, rtol=0.15)
+
+
+def test_children_are_adjusted_and_elites_are_not(key):
+    es = truncation_es(SMALL, adjust=lambda key, elites, children: 0 * children)
+    first = es.ask(key, es.init())
+    fitness = make_fitness(range(len(first)), [1.0] * len(first))
+    later = es.ask(key, es.tell(key, es.init(), first, fitness))
+    elites = SMALL.num_elites
+    np.testing.assert_array_equal(later[:elites], first[:elites])
+    assert not later[elites:].any()
+
+
+def test_a_search_hands_its_world_to_its_options(key):
+    config = preset("smoke")
+    env = dataclasses.replace(config.train.env, physics="closed_form")
+    train = dataclasses.replace(config.train, env=env)
+    sizes = {"population_size": 12, "num_elites": 2, "num_stages": 2, "init_std": 8.0}
+    options = {"start": "monotone", "keep_level": True, "mutation_std": 0.01}
+    es = _strategy(dataclasses.replace(config, train=train, **sizes, **options))
+    first = es.ask(key, es.init())
+    fitness = make_fitness(range(12), [1.0] * 12)
+    later = es.ask(key, es.tell(key, es.init(), first, fitness))
+    places = typical_lidars(make_env(env), jax.random.key(0))
+    costs = jax.vmap(lambda theta: intrinsic_cost(theta, places))
+    for theta in (first, later):
+        middle = np.log(np.median(np.asarray(costs(theta)), axis=1) / QUIET_COST)
+        assert np.abs(middle).max() < 0.2
 
 
 def test_another_start_replaces_the_first_candidates_alone(key):
