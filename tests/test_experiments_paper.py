@@ -28,6 +28,7 @@ FIGURES = (
     "total_cost",
 )
 common = load_script("experiments/common")
+computing_time = load_script("experiments/computing_time")
 paper = load_script("experiments/paper")
 searches = load_script("experiments/searches")
 transfer = load_script("experiments/transfer")
@@ -72,6 +73,48 @@ def test_the_tables_of_the_readme_are_those_of_the_results():
         render = {"evolution": searches.render, "transfer": transfer.render}
         expect = render.get(file.stem, paper.render)(result)
         assert shown.strip() == expect.strip(), name
+
+
+def test_computing_times_are_steps_over_rate_and_updates(tmp_path):
+    facts = {"device": "cpu"}
+    names = (*computing_time.PAPER_HOURS, computing_time.CLOSED_FORM)
+    steps = [
+        {"name": name, "worlds": 1024, "env_steps_per_second": 1000}
+        | {"facts": facts, "devices": 2, "command": "a"}
+        for name in names
+    ]
+    updates = [
+        {"algorithm": algorithm, "tera_flop_per_second": 0.1}
+        for algorithm in ("ppo_lagrangian", "cpo")
+    ]
+    update = {"facts": facts, "devices": 2, "command": "b", "rows": updates}
+    (tmp_path / "env_steps.json").write_text(json.dumps({"rows": steps}))
+    (tmp_path / "population_paper.json").write_text(
+        json.dumps({"parts": {"update": update}})
+    )
+    result = computing_time.collect(tmp_path)
+    hours = result["hours"]["Goal-Hazard-Point"]
+    assert hours["rollout"] == pytest.approx(333 * 30_000 / 1000 / 3600)
+    # 3.1 TFLOP an epoch, as the design counts them
+    update_hours = hours["ppo_lagrangian"] - hours["rollout"]
+    assert update_hours == pytest.approx(333 * 31 / 3600, rel=0.05)
+    agents = 50 * 7 * (hours["ppo_lagrangian"] + hours["cpo"])
+    assert result["evolution_hours"] == pytest.approx(agents)
+    assert result["hours"]["Goal-Hazard-Doggo"]["cpo"] > hours["cpo"]  # more readings
+    steps[0]["facts"] = {"device": "gpu"}
+    (tmp_path / "env_steps.json").write_text(json.dumps({"rows": steps}))
+    with pytest.raises(SystemExit, match="different devices"):
+        computing_time.collect(tmp_path)
+
+
+def test_the_table_of_computing_times_is_that_of_the_benchmarks():
+    result = computing_time.collect(ROOT / "benchmarks" / "results")
+    file = ROOT / "experiments" / "results" / "computing_time.json"
+    assert json.loads(file.read_text()) == json.loads(json.dumps(result))
+    text = (ROOT / "experiments" / "README.md").read_text()
+    shown = re.search(r"<!-- computing_time -->\n(.*?)<!-- end -->", text, re.DOTALL)
+    assert shown is not None
+    assert shown[1].strip() == computing_time.render(result).strip()
 
 
 def row(ep_return, cost, violating, episodes=100):
