@@ -139,6 +139,7 @@ BAD = {
         "zero_tolerance": NOT_NEGATIVE,
         "selection": ("best", ""),
         "start": ("uniform", ""),
+        "keep_level": (1, "yes"),
         "return_floor": FINITE,
     },
 }

@@ -235,6 +235,8 @@ class SearchConfig:
         for name, kind in (("selection", Selection), ("start", Start)):
             value, known = getattr(self, name), get_args(kind)
             require(value in known, name, f"one of {', '.join(known)}", value)
+        flag = self.keep_level
+        require(isinstance(flag, bool), "keep_level", "true or false", flag)
         floor = self.return_floor
         require(floor is None or is_finite(floor), "return_floor", "finite", floor)
         ok = is_integer(self.seed) and 0 <= self.seed < 2**32

@@ -260,7 +260,7 @@ def truncation_es(
     """
     size, elites = config.population_size, config.num_elites
     capacity = config.num_stages * size
-
+    spread = (config.mutation_std, config.mutation_low, config.mutation_high)
     first = start or functools.partial(_normal_start, config)
 
     def init() -> ESState:
@@ -277,14 +277,7 @@ def truncation_es(
     def ask(key: Key, state: ESState) -> jax.Array:
         key_init, key_mutate = jax.random.split(key)
         key_adjust = jax.random.fold_in(key, 2)  # the paper's search stays as it was
-        children = mutate(
-            key_mutate,
-            state.elites,
-            size - elites,
-            config.mutation_std,
-            config.mutation_low,
-            config.mutation_high,
-        )
+        children = mutate(key_mutate, state.elites, size - elites, *spread)
         if adjust is not None:
             children = adjust(key_adjust, state.elites, children)
         later = jnp.concatenate([state.elites, children])
@@ -294,13 +287,8 @@ def truncation_es(
 
     def tell(key: Key, state: ESState, candidates: jax.Array, fitness: Fitness):
         if config.selection == "paper":
-            parents, _ = select(
-                candidates,
-                fitness,
-                elites,
-                config.zero_tolerance,
-                config.return_floor,
-            )
+            rule = (config.zero_tolerance, config.return_floor)
+            parents, _ = select(candidates, fitness, elites, *rule)
         else:
             parents = candidates[jax.random.permutation(key, size)[:elites]]
         place = state.generation * size

@@ -1,13 +1,14 @@
 """The rows of the constraint problem against MJX's own."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from mujoco import mjx
+from scenes import mujoco
 
 from autocost_jax import env_config
 from autocost_jax.envs.models import physics_model
@@ -56,7 +57,7 @@ def test_rows_are_those_of_mjx(name, physics):
             data = data.replace(mocap_pos=data.mocap_pos.at[0, :2].set(near))
         data = mjx.com_pos(model, mjx.kinematics(model, data))
         data = mjx.collision(model, mjx.crb(model, data))
-        expect = mjx.make_constraint(model, data)._impl
+        expect: Any = mjx.make_constraint(model, data)._impl
         lanes = jax.tree.map(lambda x: x[..., None], inputs(rows, data))
         made = build(rows, float(mj_model.opt.impratio), lanes)
         jacobian, stiffness, reference = (x[..., 0] for x in made)

@@ -269,11 +269,13 @@ def _limit_rows(rows: Rows, given: Inputs) -> tuple[jax.Array, ...]:
     sign = jnp.where(above < below, 1.0, -1.0).astype(depth.dtype)
     own = np.arange(len(given.qvel))[:, None, None] == rows.limited[:, None]
     jacobian = jnp.where(own & (depth < 0), sign, 0.0)
-    return jacobian, *_hold(rows.limit_weight.astype(depth.dtype), depth, rows.limits)
+    return jacobian, *_hold(
+        jnp.asarray(rows.limit_weight, depth.dtype), depth, rows.limits
+    )
 
 
 def _hold(
-    weight: jax.Array | np.ndarray, depth: jax.Array, softness: Softness
+    weight: jax.Array, depth: jax.Array, softness: Softness
 ) -> tuple[jax.Array, jax.Array]:
     """Stiffness D and pull towards the surface, both [n, W], of rows at a depth."""
     dtype = depth.dtype
@@ -285,10 +287,10 @@ def _hold(
 
     x = jnp.minimum(jnp.abs(depth) / width, 1.0)
     y = jnp.where(x < middle, rise(x, middle), 1 - rise(1 - x, 1 - middle))
-    impedance = low + y * (high - low)
+    impedance = y * (high - low) + low
     stiffness = impedance / jnp.maximum(weight * (1 - impedance), 1e-15)
-    spring = softness.stiffness.astype(dtype) * impedance
-    return stiffness, spring * jnp.minimum(depth, 0.0)
+    pull = jnp.minimum(depth, 0.0) * impedance * softness.stiffness.astype(dtype)
+    return stiffness, pull
 
 
 def _products(axes: jax.Array, screws: jax.Array) -> list[jax.Array]:
