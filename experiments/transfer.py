@@ -25,7 +25,7 @@ SCRIPT = Path(__file__).parent / "transfer_safety_gymnasium.py"
 PYTHON = Path("benchmarks/.venv/safety_gymnasium/bin/python")
 WORLDS = ("Goal-Hazard-Point", "Goal-Hazard-Car")
 DESIGNS = ("extrinsic", "evolved")
-EPISODES = 20  # a policy; a reset there takes longer than a second
+EPISODES = 10  # a policy; a reset there takes longer than a second
 FILE = "safety_gymnasium.json"
 
 
