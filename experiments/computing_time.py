@@ -18,7 +18,6 @@ from typing import Any
 
 from autocost_jax import env_config, make_env, preset
 from autocost_jax.bench import update_flop
-from autocost_jax.config import Algorithm
 
 BENCHMARKS = Path("benchmarks/results")
 RESULT = Path("experiments/results/computing_time.json")
@@ -50,10 +49,10 @@ def hours_of_an_agent(
     own = dataclasses.replace(train, env=env_config(world))
     steps = train.num_worlds * train.env.num_steps * train.num_epochs
     result = {"rollout": steps / rate / 3600}
-    for algorithm, row in updates.items():
-        name: Algorithm = "cpo" if algorithm == "cpo" else "ppo_lagrangian"
-        flop = update_flop(own, name, make_env(own.env))
-        seconds = flop / (row["tera_flop_per_second"] * 1e12)
+    env = make_env(own.env)
+    for algorithm in preset("paper").algorithms:
+        rate_of_updates = updates[algorithm]["tera_flop_per_second"] * 1e12
+        seconds = update_flop(own, algorithm, env) / rate_of_updates
         result[algorithm] = result["rollout"] + train.num_epochs * seconds / 3600
     return result
 

@@ -276,7 +276,7 @@ def truncation_es(
 
     def ask(key: Key, state: ESState) -> jax.Array:
         key_init, key_mutate = jax.random.split(key)
-        key_adjust = jax.random.fold_in(key, 2)  # the paper's search stays as it was
+        key_adjust = jax.random.fold_in(key, 2)  # moves no other draw
         children = mutate(key_mutate, state.elites, size - elites, *spread)
         if adjust is not None:
             children = adjust(key_adjust, state.elites, children)

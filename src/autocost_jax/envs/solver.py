@@ -37,22 +37,6 @@ FULL_STEP = 1e-3  # how far from 1 the length of a full Newton step may be
 CPU_LANES = 32
 
 
-class State(NamedTuple):
-    """What the minimisation needs beside the rows, in W worlds.
-
-    Attributes:
-      mass: [nv, nv, W] M.
-      smooth: [nv, W] a.
-      force: [nv, W] M a.
-      start: [nv, W] where to begin, if that is better than a.
-    """
-
-    mass: jax.Array
-    smooth: jax.Array
-    force: jax.Array
-    start: jax.Array
-
-
 class Problem(NamedTuple):
     """The minimisation in W worlds.
 
@@ -93,7 +77,9 @@ def make_solver(
     rows = make_rows(mj_model, data)
     impratio, iterations = float(mj_model.opt.impratio), int(mj_model.opt.iterations)
 
-    def solve_lanes(given: Inputs, state: State) -> tuple[jax.Array, ...]:
+    def solve_lanes(
+        given: Inputs, state: dict[str, jax.Array]
+    ) -> tuple[jax.Array, ...]:
         problem = make_problem(*build(rows, impratio, given), state)
         qacc, force, push = minimise(problem, iterations)
         count = EDGES * len(given.depth) + len(given.limited)
@@ -102,12 +88,12 @@ def make_solver(
     solve = over_lanes(solve_lanes)
 
     def solve_constraints(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-        state = State(
-            mass=mjx.full_m(model, data),
-            smooth=data.qacc_smooth,
-            force=data.qfrc_smooth,
-            start=data.qacc_warmstart,
-        )
+        state = {
+            "mass": mjx.full_m(model, data),
+            "smooth": data.qacc_smooth,
+            "force": data.qfrc_smooth,
+            "start": data.qacc_warmstart,
+        }
         lanes = jax.tree.map(lambda x: x[..., None], (inputs(rows, data), state))
         qacc, force, push = (x[..., 0] for x in solve(*lanes))
         solved: Any = {
@@ -122,16 +108,26 @@ def make_solver(
 
 
 def make_problem(
-    jacobian: jax.Array, stiffness: jax.Array, reference: jax.Array, state: State
+    jacobian: jax.Array,
+    stiffness: jax.Array,
+    reference: jax.Array,
+    state: dict[str, jax.Array],
 ) -> Problem:
-    """The minimisation; rows are filled up so that sums over them can be halved."""
+    """The minimisation; rows are filled up so that sums over them can be halved.
+
+    Args:
+      jacobian: [nv, n, W].
+      stiffness: [n, W].
+      reference: [n, W].
+      state: the other fields.
+    """
     spare = -len(stiffness) % ROWS
     fill = ((0, spare), (0, 0))
     return Problem(
         jacobian=jnp.pad(jacobian, ((0, 0), *fill)),
         stiffness=jnp.pad(stiffness, fill),
         reference=jnp.pad(reference, fill),
-        **state._asdict(),
+        **state,
     )
 
 
