@@ -1,7 +1,7 @@
 """The evolution on Goal-Hazard-Point: the paper's rule, and a guided search beside it.
 
     python experiments/searches.py run       # searches: rules x seeds, one at a time
-    python experiments/searches.py validate  # their best costs, trained on fresh seeds
+    python experiments/searches.py validate  # their best costs, rounds of fresh seeds
     python experiments/searches.py ship      # the winner into the package, with a card
     python experiments/searches.py collect   # JSON, table, pictures of what has run
 
@@ -12,6 +12,9 @@ return less than 2 an episode behind all others (`es.rank`), and lets no mutatio
 how loud a cost is at a typical place (`es.keep_level`). "raw" is guided with the
 paper's mutations. Reduced scale: 12 candidates, 4 stages, 512,000 steps a slot; 3
 search seeds, 1 for raw. `--smoke` is for tests.
+
+What looks best in a search is partly lucky, so the best of all searches go through
+`ROUNDS` of agents with fresh seeds: many of them briefly, the best of these for longer.
 """
 
 import argparse
@@ -21,7 +24,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,10 +46,32 @@ SIZE = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "
 SIZE += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
 SIZE += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
 SMOKE = ("--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "2")
-FINALISTS = 4
-FRESH_SEEDS, EPISODES = (100, 101, 102, 103, 104), 200  # 1000 episodes a method
 COSTS = paper.COSTS
 FOUND = Path("src/autocost_jax/found")
+
+
+class Round(NamedTuple):
+    """Fresh agents for the best costs so far.
+
+    Attributes:
+      name: of its run directory.
+      entrants: how many costs take part, the best of the round before.
+      scale: of the training.
+      seeds: of the agents, one slot each.
+      episodes: fresh ones that an agent is scored in.
+    """
+
+    name: str
+    entrants: int
+    scale: str
+    seeds: tuple[int, ...]
+    episodes: int
+
+
+ROUNDS = (
+    Round("shortlist", 16, "reduced", (200, 201), 100),
+    Round("validation", 4, "reduced_2m", (100, 101, 102, 103, 104), 200),
+)
 
 
 def folder(runs: Path, rule: str, seed: int) -> Path:
@@ -75,8 +100,8 @@ def finished(runs: Path) -> list[tuple[str, int, Path]]:
     return [row for row in paths if (row[2] / "cost.json").exists()]
 
 
-def finalists(runs: Path) -> list[dict[str, Any]]:
-    """The best candidates of all searches, ranked as one population.
+def candidates(runs: Path) -> list[dict[str, Any]]:
+    """What all searches have found, best first, ranked as one population.
 
     The guided search's order: useful ones first, of them the safest. An elite that was
     trained again counts once, with the mean of its fitness, so that one lucky stage
@@ -103,7 +128,7 @@ def finalists(runs: Path) -> list[dict[str, Any]]:
     order = guided_order(
         [row["cost"] for row in rows], [row["ep_return"] for row in rows]
     )
-    return [rows[i] for i in order[:FINALISTS]]
+    return [rows[i] for i in order]
 
 
 def guided_order(costs: Sequence[float], returns: Sequence[float]) -> list[int]:
@@ -113,31 +138,39 @@ def guided_order(costs: Sequence[float], returns: Sequence[float]) -> list[int]:
 
 
 def validate(args: argparse.Namespace) -> None:
-    """Train agents of fresh seeds with each finalist; score them in fresh episodes."""
-    scale = paper.scales()[args.scale]
-    config = paper.table(paper.TRAINING_WORLD, "extrinsic", scale)
-    methods = tuple(
-        Method(f"{i}-{algorithm}", algorithm, paper.WITH_NETWORK, 0.0, theta)
-        for i, row in enumerate(finalists(args.runs))
-        for algorithm in paper.BOTH
-        for theta in [tuple(row["theta"].tolist())]
-    )
-    seeds = FRESH_SEEDS[:2] if args.smoke else FRESH_SEEDS
-    config = dataclasses.replace(config, methods=methods, seeds=seeds)
-    episodes = 2 if args.smoke else EPISODES
-    run_if_needed(config, args.runs / "validation", episodes)
+    """All rounds, one after the other."""
+    for index in range(len(ROUNDS)):
+        name, _, scale_name, seeds, episodes = ROUNDS[index]
+        scale = paper.scales()["smoke" if args.smoke else scale_name]
+        config = paper.table(paper.TRAINING_WORLD, "extrinsic", scale)
+        methods = tuple(
+            Method(f"{i}-{algorithm}", algorithm, paper.WITH_NETWORK, 0.0, theta)
+            for i, row in enumerate(entrants(args.runs, index))
+            for algorithm in paper.BOTH
+            for theta in [tuple(row["theta"].tolist())]
+        )
+        seeds = scale.seeds if args.smoke else seeds
+        config = dataclasses.replace(config, methods=methods, seeds=seeds)
+        episodes = scale.episodes if args.smoke else episodes
+        run_if_needed(config, args.runs / name, episodes)
 
 
-def validated(runs: Path) -> list[dict[str, Any]]:
-    """The finalists with their scores on fresh seeds, best first in those scores.
+def entrants(runs: Path, index: int) -> list[dict[str, Any]]:
+    """Who takes part in a round: the best of the round before, or of the searches."""
+    ranked = scored(runs, index - 1) if index else candidates(runs)
+    return ranked[: ROUNDS[index].entrants]
+
+
+def scored(runs: Path, index: int) -> list[dict[str, Any]]:
+    """The entrants of a round that was run with their scores in it, best first.
 
     Means over both algorithms, ranked as the guided search ranks.
     """
-    path = runs / "validation"
+    path = runs / ROUNDS[index].name
     config = read_config(path, TableConfig)[0]
     rows = json.loads((path / "evaluation.json").read_text())["rows"]
     result = []
-    for i, row in enumerate(finalists(runs)):
+    for i, row in enumerate(entrants(runs, index)):
         theta = np.asarray(config.methods[2 * i].theta, np.float32)
         if not np.array_equal(theta, row["theta"]):
             raise SystemExit(f"{path} was made with other searches: remove it")
@@ -147,13 +180,11 @@ def validated(runs: Path) -> list[dict[str, Any]]:
             )
             for algorithm in paper.BOTH
         }
-        result.append(row | {"validation": scores})
+        result.append(row | {ROUNDS[index].name: scores})
 
     def means(key: str) -> list[float]:
-        return [
-            float(np.mean([score[key]["mean"] for score in row["validation"].values()]))
-            for row in result
-        ]
+        scores = [row[ROUNDS[index].name].values() for row in result]
+        return [float(np.mean([s[key]["mean"] for s in row])) for row in scores]
 
     return [result[i] for i in guided_order(means("cost"), means("return"))]
 
@@ -165,7 +196,7 @@ def ship(args: argparse.Namespace) -> None:
     """
     where = args.results / "costs" if args.smoke else COSTS
     where.mkdir(parents=True, exist_ok=True)
-    for place, row in enumerate(validated(args.runs)):
+    for place, row in enumerate(scored(args.runs, len(ROUNDS) - 1)):
         config, facts = read_config(folder(args.runs, row["rule"], row["seed"]))
         name = paper.EVOLVED if place == 0 else f"runner_up_{place}"
         card = make_card(row, config) | {"commit": facts["commit"]}
@@ -186,6 +217,7 @@ def make_card(row: dict[str, Any], config: SearchConfig) -> dict[str, Any]:
         }
         for algorithm, score in row["validation"].items()
     }
+    last = ROUNDS[-1]
     violates = [paper.NAMES[a] for a, s in validation.items() if s["violations"]]
     return {
         "found": f"{row['rule']} search, seed {row['seed']}, stage {row['stage'] + 1}, "
@@ -194,8 +226,8 @@ def make_card(row: dict[str, Any], config: SearchConfig) -> dict[str, Any]:
         "budget": f"{config.env_steps:,} env steps a search, reduced scale",
         "search": {key: row[key] for key in ("cost", "ep_return", "times_trained")},
         "validation": validation,
-        "validated_on": f"training seeds {FRESH_SEEDS}, 512,000 steps each; it was "
-        f"chosen among {FINALISTS} on these, so they flatter it a little",
+        "validated_on": f"training seeds {last.seeds}, 2,048,000 steps each; it was "
+        f"chosen among {last.entrants} on these, so they flatter it a little",
         "fails": f"not free of violations under {' and '.join(violates)}"
         if violates
         else "no violation seen in validation; see the rates' upper bounds",
@@ -227,11 +259,12 @@ def collect(args: argparse.Namespace) -> None:
         "facts": facts,
         "searches": searches,
     }
-    if (args.runs / "validation" / "evaluation.json").exists():
-        result["finalists"] = [
-            {key: value for key, value in row.items() if key != "theta"}
-            for row in validated(args.runs)
-        ]
+    for index, part in enumerate(ROUNDS):
+        if (args.runs / part.name / "evaluation.json").exists():
+            result[part.name] = [
+                {key: value for key, value in row.items() if key != "theta"}
+                for row in scored(args.runs, index)
+            ]
     result = json.loads(json.dumps(to_json(result), allow_nan=False))
     file = paper.write(result, "evolution", args.results)
     file.with_suffix(".md").write_text(render(result))
@@ -259,15 +292,21 @@ def render(result: dict[str, Any]) -> str:
             f"| {means(search['cost'], 2)} | {best} "
             f"| {means(search['return'], 1)} | {zero} |"
         )
-    if "finalists" in result:
-        lines += [
-            "",
-            "| finalist | search: cost, return | algorithm | return (95 %) "
-            "| extrinsic cost (95 %) | violating episodes | at most (95 %) |",
-            "|---|---|---|---|---|---|---|",
-        ]
-    for row in result.get("finalists", []):
-        for algorithm, score in row["validation"].items():
+    for part in ROUNDS:
+        if part.name in result:
+            lines += ["", *render_round(part, result[part.name])]
+    return "\n".join(lines) + "\n"
+
+
+def render_round(part: Round, rows: list[dict[str, Any]]) -> list[str]:
+    """The entrants of a round, best first."""
+    lines = [
+        f"| {part.name} | search: cost, return | algorithm | return (95 %) "
+        "| extrinsic cost (95 %) | violating episodes | at most (95 %) |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        for algorithm, score in row[part.name].items():
             gain, cost = score["return"], score["cost"]
             lines.append(
                 f"| {row['rule']} {row['seed']}, stage {row['stage'] + 1}, "
@@ -278,7 +317,7 @@ def render(result: dict[str, Any]) -> str:
                 f"{cost['high']:.2f}) | {score['violations']} of {score['episodes']} "
                 f"| {score['violation_rate_upper']:.1%} |"
             )
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def draw(result: dict[str, Any], file: Path) -> None:

@@ -65,7 +65,7 @@ def test_the_scale_of_the_paper_is_its_preset():
 
 def test_the_tables_of_the_readme_are_those_of_the_results():
     text = (ROOT / "experiments" / "README.md").read_text()
-    blocks = re.findall(r"<!-- (reduced/\w+) -->\n(.*?)<!-- end -->", text, re.DOTALL)
+    blocks = re.findall(r"<!-- (reduced\w*/\w+) -->\n(.*?)<!-- end -->", text, re.DOTALL)
     assert {name for name, _ in blocks} >= {"reduced/evolution", "reduced/margins"}
     for name, shown in blocks:
         file = ROOT / "experiments" / "results" / f"{name}.json"
@@ -205,36 +205,40 @@ def write_search(runs, costs, returns):
     return theta
 
 
-def write_validation(runs, scores):
-    """Scores of each finalist, (return, cost, violating of 100) by algorithm."""
+def write_round(runs, index, scores):
+    """Scores of each entrant, (return, cost, violating of 100) by algorithm."""
     methods, rows = [], []
-    for i, row_of in enumerate(searches.finalists(runs)):
+    for i, row_of in enumerate(searches.entrants(runs, index)):
         theta = tuple(row_of["theta"].tolist())
         for algorithm, score in zip(paper.BOTH, scores[i], strict=True):
             label = f"{i}-{algorithm}"
             methods.append(Method(label, algorithm, paper.WITH_NETWORK, 0.0, theta))
             rows.append({"method": label, "seed": 100} | row(*score))
     config = TableConfig(preset("smoke").train, tuple(methods), (100,))
-    with RunDir.create(runs / "validation", config) as run:
+    with RunDir.create(runs / searches.ROUNDS[index].name, config) as run:
         run.write_json("evaluation", {"episodes": 100, "rows": rows})
 
 
-def test_the_shipped_cost_is_the_best_useful_finalist(tmp_path):
+def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     """Timid candidates come last, one that was trained twice counts by its mean."""
     costs = [[0.0, 1.0, 0.5, 9.0], [3.0, 4.0, 5.0, 6.0]]
     returns = [[-3.0, 5.0, 1.0, 9.0], [7.0, 6.0, 5.0, 4.0]]
     runs = tmp_path / "runs"
     theta = write_search(runs, costs, returns)
-    found = searches.finalists(runs)
-    assert [row["index"] for row in found] == [1, 1, 2, 3]
-    assert (found[0]["cost"], found[0]["times_trained"]) == (2.0, 2)
-    worst, best = [(1.0, 0.0, 0)] * 2, [(4.0, 0.1, 3), (3.0, 0.0, 0)]
-    write_validation(runs, [worst, best, [(9.0, 4.0, 60)] * 2, [(9.0, 3.0, 50)] * 2])
+    ranked = searches.candidates(runs)
+    assert [row["index"] for row in ranked] == [1, 1, 2, 3, 3, 2, 0]
+    assert (ranked[0]["cost"], ranked[0]["times_trained"]) == (2.0, 2)
+    worse = [[(9.0, 4.0 + i, 60)] * 2 for i in range(5)]
+    write_round(runs, 0, [worse[0], *[[(3.0, 2.0, 50)] * 2] * 2, *worse[1:]])
+    found = searches.entrants(runs, 1)
+    assert [row["index"] for row in found] == [1, 2, 1, 3]
+    timid, best = [(1.0, 0.0, 0)] * 2, [(4.0, 0.1, 3), (3.0, 0.0, 0)]
+    write_round(runs, 1, [timid, best, *worse[:2]])
     args = argparse.Namespace(runs=runs, results=tmp_path, smoke=True, scale="smoke")
     searches.ship(args)
     shipped = load_cost(tmp_path / "costs" / "ic4srl_reduced")
     np.testing.assert_array_equal(shipped, found[1]["theta"])
-    np.testing.assert_array_equal(found[1]["theta"], theta[1, 1])
+    np.testing.assert_array_equal(found[1]["theta"], theta[1, 2])
     card = cost_card(tmp_path / "costs" / "ic4srl_reduced")
     assert card["fails"] == "not free of violations under PPO-Lag"
     assert card["validation"]["cpo"]["violation_rate_upper"] > 0
@@ -242,6 +246,8 @@ def test_the_shipped_cost_is_the_best_useful_finalist(tmp_path):
     searches.collect(args)
     table = (tmp_path / "evolution.md").read_text()
     assert "| guided, 0 | 2.62, 4.50 | 0.00, 3.00 |" in table
+    assert "| shortlist |" in table
+    assert "| validation |" in table
     assert (tmp_path / "heat_map.png").exists()
     assert (tmp_path / "evolution.png").exists()
 
