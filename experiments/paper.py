@@ -98,7 +98,7 @@ def scales() -> dict[str, Scale]:
     slow = {
         "Goal-Pillar-Point": (4, 64, 200),
         "Push-Hazard-Point": (4, 64, 100),
-        "Push-Pillar-Point": (4, 64, 100),
+        "Push-Pillar-Point": (4, 32, 50),
         "Goal-Hazard-Car": (4, 64, 100),
         "Goal-Hazard-Doggo": (4, 64, 50),
     }
