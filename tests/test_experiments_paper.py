@@ -65,7 +65,9 @@ def test_the_scale_of_the_paper_is_its_preset():
 
 def test_the_tables_of_the_readme_are_those_of_the_results():
     text = (ROOT / "experiments" / "README.md").read_text()
-    blocks = re.findall(r"<!-- (reduced\w*/\w+) -->\n(.*?)<!-- end -->", text, re.DOTALL)
+    blocks = re.findall(
+        r"<!-- (reduced\w*/\w+) -->\n(.*?)<!-- end -->", text, re.DOTALL
+    )
     assert {name for name, _ in blocks} >= {"reduced/evolution", "reduced/margins"}
     for name, shown in blocks:
         file = ROOT / "experiments" / "results" / f"{name}.json"
