@@ -100,7 +100,7 @@ def scales() -> dict[str, Scale]:
         "Push-Hazard-Point": (4, 64, 100),
         "Push-Pillar-Point": (4, 32, 50),
         "Goal-Hazard-Car": (4, 64, 100),
-        "Goal-Hazard-Doggo": (4, 64, 50),
+        "Goal-Hazard-Doggo": (4, 20, 25),
     }
     slow_2m = {world: (n, 4 * t, episodes) for world, (n, t, episodes) in slow.items()}
     reduced = dataclasses.replace(laptop, num_epochs=64, chunk_epochs=4)
