@@ -19,6 +19,7 @@ What looks best in a search is partly lucky, so the best of all searches go thro
 
 import argparse
 import dataclasses
+import itertools
 import json
 import subprocess
 import sys
@@ -46,6 +47,7 @@ SIZE = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "
 SIZE += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
 SIZE += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
 SMOKE = ("--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "2")
+LOUDNESS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # a step, within 1.5 R of a hazard
 COSTS = paper.COSTS
 FOUND = Path("src/autocost_jax/found")
 
@@ -258,6 +260,7 @@ def collect(args: argparse.Namespace) -> None:
         "command": "python experiments/searches.py run",
         "facts": facts,
         "searches": searches,
+        "loudness": by_loudness(args.runs),
     }
     for index, part in enumerate(ROUNDS):
         if (args.runs / part.name / "evaluation.json").exists():
@@ -271,6 +274,31 @@ def collect(args: argparse.Namespace) -> None:
     draw(result, file.with_suffix(".png"))
     draw_heat_map(args)
     print(file)
+
+
+def by_loudness(runs: Path) -> list[dict[str, Any]]:
+    """Mean fitness of all that was trained, by the cost of a step near a hazard.
+
+    That of the states which the candidate's own agents have visited.
+    """
+    tables = [
+        load_arrays(file)
+        for _, _, path in finished(runs)
+        for file in list_stages(path).values()
+    ]
+    if not tables:
+        return []
+    cost, gain, near = (
+        np.concatenate([np.atleast_2d(table[name]).mean(0) for table in tables])
+        for name in ("cost", "ep_return", "scores/intrinsic_near")
+    )
+    rows = []
+    for low, high in itertools.pairwise(LOUDNESS):
+        own = (near >= low) & (near < high)
+        if own.any():
+            row = {"low": low, "high": high, "count": int(own.sum())}
+            rows.append(row | {"cost": cost[own].mean(), "return": gain[own].mean()})
+    return rows
 
 
 def render(result: dict[str, Any]) -> str:
@@ -291,6 +319,16 @@ def render(result: dict[str, Any]) -> str:
             f"| {search['rule']}, {search['seed']} "
             f"| {means(search['cost'], 2)} | {best} "
             f"| {means(search['return'], 1)} | {zero} |"
+        )
+    lines += [
+        "",
+        "| cost of a step near a hazard | trained | mean cost | mean return |",
+        "|---|---|---|---|",
+    ]
+    for row in result["loudness"]:
+        lines.append(
+            f"| {row['low']} to {row['high']} | {row['count']} | {row['cost']:.1f} "
+            f"| {row['return']:.1f} |"
         )
     for part in ROUNDS:
         if part.name in result:

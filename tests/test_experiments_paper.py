@@ -193,6 +193,7 @@ def write_search(runs, costs, returns):
     config = dataclasses.replace(preset("smoke"), seed=0)
     theta = np.arange(8 * 41, dtype=np.float32).reshape(2, 4, 41)
     theta[1, 0] = theta[0, 1]
+    near = np.array([[0.002, 0.02, 0.02, 0.4], [0.002, 0.04, 0.05, 0.6]])
     with RunDir.create(searches.folder(runs, "guided", 0), config) as run:
         for stage in range(2):
             run.write_stage(
@@ -201,6 +202,7 @@ def write_search(runs, costs, returns):
                     "theta": theta[stage],
                     "cost": np.float32(costs[stage]),
                     "ep_return": np.float32(returns[stage]),
+                    "scores/intrinsic_near": near,
                 },
             )
         run.write_cost({"theta": theta[0, 0]}, {"search_cost": 0.0})
@@ -248,6 +250,9 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     searches.collect(args)
     table = (tmp_path / "evolution.md").read_text()
     assert "| guided, 0 | 2.62, 4.50 | 0.00, 3.00 |" in table
+    assert "| 0.003 to 0.01 |" not in table
+    assert "| 0.03 to 0.1 | 2 | 4.5 | 5.5 |" in table
+    assert "| 0.3 to 1.0 | 2 | 7.5 | 6.5 |" in table
     assert "| shortlist |" in table
     assert "| validation |" in table
     assert (tmp_path / "heat_map.png").exists()
