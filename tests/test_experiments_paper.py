@@ -193,7 +193,7 @@ def write_search(runs, costs, returns):
     config = dataclasses.replace(preset("smoke"), seed=0)
     theta = np.arange(8 * 41, dtype=np.float32).reshape(2, 4, 41)
     theta[1, 0] = theta[0, 1]
-    near = np.array([[0.002, 0.02, 0.02, 0.4], [0.002, 0.04, 0.05, 0.6]])
+    near = np.array([[0.0, 0.02, 0.03, 0.4], [0.004, 0.06, 0.05, 0.6]])  # [A, P]
     with RunDir.create(searches.folder(runs, "guided", 0), config) as run:
         for stage in range(2):
             run.write_stage(
@@ -251,7 +251,7 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     table = (tmp_path / "evolution.md").read_text()
     assert "| guided, 0 | 2.62, 4.50 | 0.00, 3.00 |" in table
     assert "| 0.003 to 0.01 |" not in table
-    assert "| 0.03 to 0.1 | 2 | 4.5 | 5.5 |" in table
+    assert "| 0.03 to 0.1 | 4 | 2.6 | 4.2 |" in table
     assert "| 0.3 to 1.0 | 2 | 7.5 | 6.5 |" in table
     assert "| shortlist |" in table
     assert "| validation |" in table
