@@ -338,23 +338,25 @@ def render(result: dict[str, Any]) -> str:
 
 def render_round(part: Round, rows: list[dict[str, Any]]) -> list[str]:
     """The entrants of a round, best first."""
+    columns = ("return (95 %)", "cost (95 %)", "violating (at most)")
+    heads = [f"{paper.NAMES[a]}: {c}" for a in paper.BOTH for c in columns]
     lines = [
-        f"| {part.name} | search: cost, return | algorithm | return (95 %) "
-        "| extrinsic cost (95 %) | violating episodes | at most (95 %) |",
-        "|---|---|---|---|---|---|---|",
+        f"| {part.name} | search: cost, return | {' | '.join(heads)} |",
+        "|---" * (2 + len(heads)) + "|",
     ]
     for row in rows:
-        for algorithm, score in row[part.name].items():
+        cells = [
+            f"{row['rule']} {row['seed']}, stage {row['stage'] + 1}, {row['index']}",
+            f"{row['cost']:.2f}, {row['ep_return']:.1f}",
+        ]
+        for score in row[part.name].values():
             gain, cost = score["return"], score["cost"]
-            lines.append(
-                f"| {row['rule']} {row['seed']}, stage {row['stage'] + 1}, "
-                f"{row['index']} | {row['cost']:.2f}, {row['ep_return']:.1f} "
-                f"| {paper.NAMES[algorithm]} "
-                f"| {gain['mean']:.1f} ({gain['low']:.1f} to {gain['high']:.1f}) "
-                f"| {cost['mean']:.2f} ({cost['low']:.2f} to "
-                f"{cost['high']:.2f}) | {score['violations']} of {score['episodes']} "
-                f"| {score['violation_rate_upper']:.1%} |"
-            )
+            cells += [
+                f"{gain['mean']:.1f} ({gain['low']:.1f} to {gain['high']:.1f})",
+                f"{cost['mean']:.2f} ({cost['low']:.2f} to {cost['high']:.2f})",
+                f"{score['violation_rate']:.1%} ({score['violation_rate_upper']:.1%})",
+            ]
+        lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
