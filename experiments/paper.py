@@ -97,10 +97,10 @@ def scales() -> dict[str, Scale]:
     laptop, smoke = preset("laptop").train, preset("smoke").train
     slow = {
         "Goal-Pillar-Point": (4, 64, 200),
-        "Push-Hazard-Point": (4, 64, 100),
-        "Push-Pillar-Point": (4, 32, 50),
-        "Goal-Hazard-Car": (4, 64, 100),
-        "Goal-Hazard-Doggo": (4, 20, 25),
+        "Push-Hazard-Point": (4, 32, 50),
+        "Push-Pillar-Point": (4, 32, 25),
+        "Goal-Hazard-Car": (4, 64, 50),
+        "Goal-Hazard-Doggo": (4, 16, 25),
     }
     slow_2m = {world: (n, 4 * t, episodes) for world, (n, t, episodes) in slow.items()}
     reduced = dataclasses.replace(laptop, num_epochs=64, chunk_epochs=4)
