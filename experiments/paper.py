@@ -141,7 +141,7 @@ def table(world: str, design: str, scale: Scale) -> TableConfig:
     if world == TRAINING_WORLD:  # equal to MJX to rounding, and faster
         env = dataclasses.replace(env, physics="closed_form")
     train, steps = scale.train, scale.train.env.num_steps
-    worlds, epochs, _ = size(world, scale)
+    worlds, epochs, _ = world_size(world, scale)
     train = dataclasses.replace(
         train,
         env=dataclasses.replace(env, num_steps=steps),
@@ -154,7 +154,7 @@ def table(world: str, design: str, scale: Scale) -> TableConfig:
     return TableConfig(train, methods, scale.seeds)
 
 
-def size(world: str, scale: Scale) -> tuple[int, int, int]:
+def world_size(world: str, scale: Scale) -> tuple[int, int, int]:
     """Worlds a slot, epochs and episodes."""
     usual = (scale.train.num_worlds, scale.train.num_epochs, scale.episodes)
     return scale.sizes.get(world, usual)
@@ -170,7 +170,7 @@ def run(figure: Figure, scale: Scale, runs: Path) -> None:
     for world in figure.worlds:
         for design in figure.designs:
             config = table(world, design, scale)
-            episodes = size(world, scale)[2]
+            episodes = world_size(world, scale)[2]
             run_if_needed(config, run_dir(runs, world, design), episodes)
 
 

@@ -63,6 +63,17 @@ def test_the_scale_of_the_paper_is_its_preset():
     assert train.agent.policy_minibatches == 1
 
 
+def test_a_longer_scale_differs_in_epochs_alone():
+    short, long = (paper.scales()[name] for name in ("reduced", "reduced_2m"))
+    for world in ("Goal-Hazard-Point", "Goal-Hazard-Car"):
+        configs = [paper.table(world, "steep", scale) for scale in (short, long)]
+        epochs = 4 * configs[0].train.num_epochs
+        train = dataclasses.replace(configs[0].train, num_epochs=epochs)
+        assert dataclasses.replace(configs[0], train=train) == configs[1]
+    assert paper.world_size("Goal-Hazard-Point", short) == (8, 64, 200)
+    assert paper.world_size("Goal-Hazard-Car", long) == (4, 256, 50)
+
+
 def test_the_tables_of_the_readme_are_those_of_the_results():
     text = (ROOT / "experiments" / "README.md").read_text()
     blocks = re.findall(
