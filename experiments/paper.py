@@ -1,8 +1,9 @@
 """What the figures of the paper share: cost designs, training, statistics, pictures.
 
-A *design* is a training cost and its limit. It is trained once for each world, by
-PPO-Lagrangian and CPO with every seed side by side (one table of slots), and serves
-all figures that show it. A figure is a list of designs and worlds: `Figure`, `main`.
+A *design* is a training cost and its limit, trained by PPO-Lagrangian and CPO with
+every seed. A figure is a list of designs and worlds: `Figure`, `main`. What it lacks in
+a world is trained side by side, as one table of slots; what another figure has trained
+already is taken from there.
 
     python experiments/cost_limits.py run       # train what is not trained yet
     python experiments/cost_limits.py collect   # JSON, table, picture of all runs
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import check_same, compact, run_if_needed
+from common import compact, run_if_needed
 
 from autocost_jax import TrainConfig, env_config, load_cost, preset
 from autocost_jax.commandline import use_compile_cache, use_devices
@@ -133,10 +134,8 @@ class Figure(NamedTuple):
     curves: tuple[str, ...] = ("ep_return", "ep_cost")
 
 
-def table(world: str, design: str, scale: Scale) -> TableConfig:
-    """What is trained for one design in one world."""
-    cost = DESIGNS[design]
-    theta = None if cost.theta is None else tuple(load_cost(cost.theta).tolist())
+def table(world: str, designs: Sequence[str], scale: Scale) -> TableConfig:
+    """What is trained for some designs in one world."""
     env = env_config(world)
     if world == TRAINING_WORLD:  # equal to MJX to rounding, and faster
         env = dataclasses.replace(env, physics="closed_form")
@@ -148,10 +147,18 @@ def table(world: str, design: str, scale: Scale) -> TableConfig:
         num_worlds=worlds,
         num_epochs=epochs,
     )
-    methods = tuple(
-        Method(name, name, cost.cost, cost.limit, theta) for name in cost.algorithms
+    rows = tuple(method for design in designs for method in methods(design))
+    return TableConfig(train, rows, scale.seeds)
+
+
+def methods(design: str) -> tuple[Method, ...]:
+    """A design's rows of a table."""
+    cost = DESIGNS[design]
+    theta = None if cost.theta is None else tuple(load_cost(cost.theta).tolist())
+    return tuple(
+        Method(f"{design}-{name}", name, cost.cost, cost.limit, theta)
+        for name in cost.algorithms
     )
-    return TableConfig(train, methods, scale.seeds)
 
 
 def world_size(world: str, scale: Scale) -> tuple[int, int, int]:
@@ -160,36 +167,60 @@ def world_size(world: str, scale: Scale) -> tuple[int, int, int]:
     return scale.sizes.get(world, usual)
 
 
-def run_dir(runs: Path, world: str, design: str) -> Path:
-    """Where a design's training in a world is kept, for all figures."""
-    return runs / world / design
-
-
 def run(figure: Figure, scale: Scale, runs: Path) -> None:
-    """Train the figure's designs, but for what another figure has trained already."""
+    """Train what the figure lacks, all of it side by side in each world."""
     for world in figure.worlds:
-        for design in figure.designs:
-            config = table(world, design, scale)
+        designs = [d for d in figure.designs if find(runs, world, d, scale) is None]
+        if designs:
+            config = table(world, designs, scale)
             episodes = world_size(world, scale)[2]
-            run_if_needed(config, run_dir(runs, world, design), episodes)
+            run_if_needed(config, runs / world / "+".join(designs), episodes)
 
 
-def scores(path: Path, wanted: TableConfig) -> dict[str, Any]:
-    """Of one trained design: for each algorithm its scores, and its curves."""
-    check_same(wanted, path)
-    config, facts = read_config(path, TableConfig)
-    rows = json.loads((path / "evaluation.json").read_text())["rows"]
-    metrics = read_metrics(path)
+class Trained(NamedTuple):
+    """Where a design has been trained.
+
+    Attributes:
+      path: the run directory.
+      labels: what the design's algorithms are called there.
+    """
+
+    path: Path
+    labels: dict[str, str]
+
+
+def find(runs: Path, world: str, design: str, scale: Scale) -> Trained | None:
+    """The finished run that holds a design, whatever else was trained in it."""
+
+    def content(method: Method) -> Method:
+        return dataclasses.replace(method, label="")
+
+    wanted = table(world, [design], scale)
+    for file in sorted((runs / world).glob("*/evaluation.json")):
+        config = read_config(file.parent, TableConfig)[0]
+        labels = {content(method): method.label for method in config.methods}
+        same = (config.train, config.seeds) == (wanted.train, wanted.seeds)
+        if same and all(content(method) in labels for method in wanted.methods):
+            own = {m.algorithm: labels[content(m)] for m in wanted.methods}
+            return Trained(file.parent, own)
+    return None
+
+
+def scores(trained: Trained) -> dict[str, Any]:
+    """Of a trained design: for each algorithm its scores, and its curves."""
+    config, facts = read_config(trained.path, TableConfig)
+    rows = json.loads((trained.path / "evaluation.json").read_text())["rows"]
+    metrics = read_metrics(trained.path)
     result: dict[str, Any] = {}
-    for group in config.algorithms:
+    for algorithm, label in trained.labels.items():
+        group = "cpo" if algorithm == "cpo" else "ppo_lagrangian"
         slots = config.group(group)
-        for method in dict.fromkeys(method.label for method, _ in slots):
-            own = [i for i, (slot, _) in enumerate(slots) if slot.label == method]
-            result[method] = summarise([r for r in rows if r["method"] == method])
-            result[method]["curves"] = {
-                name: curve([np.take(row[f"{group}/{name}"], own) for row in metrics])
-                for name in CURVES
-            }
+        own = [i for i, (slot, _) in enumerate(slots) if slot.label == label]
+        result[algorithm] = summarise([r for r in rows if r["method"] == label])
+        result[algorithm]["curves"] = {
+            name: curve([np.take(row[f"{group}/{name}"], own) for row in metrics])
+            for name in CURVES
+        }
     train = config.train
     steps = train.num_worlds * train.env.num_steps * train.num_epochs
     run = {name: facts[name] for name in ("commit", "created", "num_devices")}
@@ -257,9 +288,9 @@ def collect(figure: Figure, scale_name: str, runs: Path, results: Path) -> None:
     scale = scales()[scale_name]
     panels = {
         world: {
-            design: scores(run_dir(runs, world, design), table(world, design, scale))
+            design: scores(trained)
             for design in figure.designs
-            if (run_dir(runs, world, design) / "evaluation.json").exists()
+            if (trained := find(runs, world, design, scale)) is not None
         }
         for world in figure.worlds
     }

@@ -144,7 +144,7 @@ def validate(args: argparse.Namespace) -> None:
     for index in range(len(ROUNDS)):
         name, _, scale_name, seeds, episodes = ROUNDS[index]
         scale = paper.scales()["smoke" if args.smoke else scale_name]
-        config = paper.table(paper.TRAINING_WORLD, "extrinsic", scale)
+        config = paper.table(paper.TRAINING_WORLD, ["extrinsic"], scale)
         methods = tuple(
             Method(f"{i}-{algorithm}", algorithm, paper.WITH_NETWORK, 0.0, theta)
             for i, row in enumerate(entrants(args.runs, index))

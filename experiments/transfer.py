@@ -26,42 +26,50 @@ PYTHON = Path("benchmarks/.venv/safety_gymnasium/bin/python")
 WORLDS = ("Goal-Hazard-Point", "Goal-Hazard-Car")
 DESIGNS = ("extrinsic", "evolved")
 EPISODES = 10  # a policy; a reset there takes longer than a second
-FILE = "safety_gymnasium.json"
 
 
-def run(runs: Path, python: Path, episodes: int) -> None:
+def run(runs: Path, python: Path, scale: paper.Scale, episodes: int) -> None:
     """Play each policy there; what has been played is kept."""
     if not python.exists():
         raise SystemExit(
             f"no {python}: `python benchmarks/peers.py --only safety_gymnasium` "
             "makes it, or name another one with --python"
         )
-    for path, world in trained(runs):
-        file = path / FILE
+    for world, design, found in trained(runs, scale):
+        file = played(found, design)
         if file.exists():
             continue
         rows = []
-        for policy in sorted((path / "policies").glob("*.npz")):
-            method, _, seed = policy.stem.rpartition("_seed")
-            robot = env_config(world).robot
-            words = [str(python), str(SCRIPT), str(policy), robot, str(episodes), seed]
-            done = subprocess.run(words, capture_output=True, text=True, check=False)
-            if done.returncode:
-                raise SystemExit(f"{policy}: {done.stderr.strip()[-500:]}")
-            rows.append(
-                {"method": method, "seed": int(seed)}
-                | json.loads(done.stdout.splitlines()[-1])
-            )
-            print(
-                path, rows[-1]["method"], seed, np.mean(rows[-1]["return"]), flush=True
-            )
+        for method, label in found.labels.items():
+            for seed in scale.seeds:
+                policy = found.path / "policies" / f"{label}_seed{seed}.npz"
+                scores = play(python, policy, env_config(world).robot, episodes, seed)
+                rows.append({"method": method, "seed": seed} | scores)
+                print(world, label, seed, np.mean(scores["return"]), flush=True)
         write_atomic(file, json.dumps(rows).encode())
 
 
-def trained(runs: Path) -> list[tuple[Path, str]]:
-    """Run directories with policies, and their worlds."""
-    paths = [(paper.run_dir(runs, w, d), w) for w in WORLDS for d in DESIGNS]
-    return [(path, w) for path, w in paths if (path / "evaluation.json").exists()]
+def play(
+    python: Path, policy: Path, robot: str, episodes: int, seed: int
+) -> dict[str, Any]:
+    """Return and cost of each episode there."""
+    words = [str(python), str(SCRIPT), str(policy), robot, str(episodes), str(seed)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{policy}: {done.stderr.strip()[-500:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def trained(runs: Path, scale: paper.Scale) -> list[tuple[str, str, paper.Trained]]:
+    """World, design and run of what has been trained."""
+    names = [(world, design) for world in WORLDS for design in DESIGNS]
+    found = [(w, d, paper.find(runs, w, d, scale)) for w, d in names]
+    return [(w, d, run) for w, d, run in found if run is not None]
+
+
+def played(found: paper.Trained, design: str) -> Path:
+    """What a design's policies did there."""
+    return found.path / f"safety_gymnasium_{design}.json"
 
 
 def compare(theirs: Sequence[Any], ours: Sequence[Any]) -> dict[str, Any]:
@@ -108,20 +116,20 @@ def rate_difference(a: int, of_a: int, b: int, of_b: int) -> dict[str, float]:
 def collect(runs: Path, results: Path, scale: str) -> None:
     """Write the JSON and the table."""
     rows = []
-    for path, world in trained(runs):
-        if not (path / FILE).exists():
+    for world, design, found in trained(runs, paper.scales()[scale]):
+        if not played(found, design).exists():
             continue
-        theirs = json.loads((path / FILE).read_text())
-        ours = json.loads((path / "evaluation.json").read_text())["rows"]
-        for method in dict.fromkeys(row["method"] for row in ours):
+        theirs = json.loads(played(found, design).read_text())
+        ours = json.loads((found.path / "evaluation.json").read_text())["rows"]
+        for method, label in found.labels.items():
             pair = [
                 sorted(
-                    (row for row in table if row["method"] == method),
+                    (row for row in table if row["method"] == name),
                     key=lambda row: row["seed"],
                 )
-                for table in (theirs, ours)
+                for table, name in ((theirs, method), (ours, label))
             ]
-            row = {"world": world, "design": path.name, "method": method}
+            row = {"world": world, "design": design, "method": method}
             rows.append(row | compare(*pair))
     facts = run_facts()
     facts.pop("seed")
@@ -170,6 +178,7 @@ if __name__ == "__main__":
     parser.add_argument("--python", type=Path, default=PYTHON)
     args = paper.arguments(parser)
     if args.part == "run":
-        run(args.runs, args.python, 1 if args.smoke else EPISODES)
+        scale = paper.scales()[args.scale]
+        run(args.runs, args.python, scale, 1 if args.smoke else EPISODES)
     else:
         collect(args.runs, args.results, args.scale)

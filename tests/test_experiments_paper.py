@@ -47,7 +47,7 @@ def test_a_figure_names_itself_and_what_exists(name):
 @pytest.mark.parametrize("design", paper.DESIGNS)
 def test_a_design_is_trained_by_both_algorithms_with_every_seed(design):
     scale = paper.scales()["reduced"]
-    config = paper.table("Goal-Pillar-Point", design, scale)
+    config = paper.table("Goal-Pillar-Point", [design], scale)
     cost = paper.DESIGNS[design]
     assert config.seeds == (0, 1, 2, 3, 4)
     assert {method.algorithm for method in config.methods} == set(cost.algorithms)
@@ -57,7 +57,8 @@ def test_a_design_is_trained_by_both_algorithms_with_every_seed(design):
 
 
 def test_the_scale_of_the_paper_is_its_preset():
-    train = paper.table("Goal-Hazard-Point", "extrinsic", paper.scales()["paper"]).train
+    scale = paper.scales()["paper"]
+    train = paper.table("Goal-Hazard-Point", ["extrinsic"], scale).train
     assert (train.num_worlds, train.num_epochs) == (30, 333)
     assert train.agent.hidden_sizes == (256, 256)
     assert train.agent.policy_minibatches == 1
@@ -66,7 +67,7 @@ def test_the_scale_of_the_paper_is_its_preset():
 def test_a_longer_scale_differs_in_epochs_alone():
     short, long = (paper.scales()[name] for name in ("reduced", "reduced_2m"))
     for world in ("Goal-Hazard-Point", "Goal-Hazard-Car"):
-        configs = [paper.table(world, "steep", scale) for scale in (short, long)]
+        configs = [paper.table(world, ["steep"], scale) for scale in (short, long)]
         epochs = 4 * configs[0].train.num_epochs
         train = dataclasses.replace(configs[0].train, num_epochs=epochs)
         assert dataclasses.replace(configs[0], train=train) == configs[1]
@@ -191,10 +192,10 @@ def test_policies_are_compared_one_by_one():
 
 def test_a_run_of_another_cost_is_not_taken_for_this_one(tmp_path):
     scale = paper.scales()["smoke"]
-    old = paper.table("Goal-Hazard-Point", "extrinsic", scale)
+    old = paper.table("Goal-Hazard-Point", ["extrinsic"], scale)
     RunDir.create(tmp_path / "run", old).close()
     common.check_same(old, tmp_path / "run")
-    new = paper.table("Goal-Hazard-Point", "limit_-1", scale)
+    new = paper.table("Goal-Hazard-Point", ["limit_-1"], scale)
     with pytest.raises(SystemExit, match=r"'limit': 0\.0.* wanted .*'limit': -1\.0"):
         common.check_same(new, tmp_path / "run")
 
@@ -270,6 +271,28 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     assert (tmp_path / "evolution.png").exists()
 
 
+def test_a_design_is_found_in_whatever_table_it_was_trained(tmp_path):
+    """By what was trained: not by its label, nor with another cost or size."""
+    scale, world = paper.scales()["smoke"], "Goal-Hazard-Point"
+    config = paper.table(world, ["extrinsic", "steep", "unconstrained"], scale)
+    old = dataclasses.replace(config.methods[0], label="as it was called before")
+    config = dataclasses.replace(config, methods=(old, *config.methods[1:]))
+    assert paper.find(tmp_path, world, "steep", scale) is None
+    with RunDir.create(tmp_path / world / "joint", config) as run:
+        assert paper.find(tmp_path, world, "steep", scale) is None  # not finished
+        run.write_json("evaluation", {"episodes": 2, "rows": []})
+    found = paper.find(tmp_path, world, "steep", scale)
+    labels = {"ppo_lagrangian": "steep-ppo_lagrangian", "cpo": "steep-cpo"}
+    assert found == paper.Trained(tmp_path / world / "joint", labels)
+    assert paper.find(tmp_path, world, "extrinsic", scale).labels == {
+        "ppo_lagrangian": "as it was called before",
+        "cpo": "extrinsic-cpo",
+    }
+    assert paper.find(tmp_path, world, "unconstrained", scale) is not None
+    assert paper.find(tmp_path, world, "limit_-1", scale) is None
+    assert paper.find(tmp_path, world, "steep", paper.scales()["reduced"]) is None
+
+
 def test_one_figure_from_training_to_picture(tmp_path):
     words = ["--smoke", "--runs", str(tmp_path / "runs"), "--results", str(tmp_path)]
     for part in ("run", "run", "collect"):  # the second finds everything done
@@ -278,6 +301,10 @@ def test_one_figure_from_training_to_picture(tmp_path):
             check=True,
             cwd=ROOT,
         )
+    trained = [
+        path.name for path in (tmp_path / "runs" / "Goal-Hazard-Point").iterdir()
+    ]
+    assert trained == ["limit_0.5+extrinsic"]  # side by side
     result = json.loads((tmp_path / "cost_limits.json").read_text())
     panel = result["worlds"]["Goal-Hazard-Point"]
     assert list(panel) == ["limit_0.5", "extrinsic"]
