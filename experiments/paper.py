@@ -401,8 +401,11 @@ def draw(figure: Figure, result: dict[str, Any], file: Path) -> None:
                     )
                     low, high = smooth(values["low"]), smooth(values["high"])
                     panel.fill_between(steps, low, high, color=color, alpha=0.1)
-        axes[0, column].set_title(f"{world}\n{caption(result, world)}", fontsize=7)
+        title = caption(result, world).replace("slot, ", "slot,\n")
+        axes[0, column].set_title(f"{world}\n{title}", fontsize=7)
         axes[-1, column].set_xlabel("env steps a slot")
+        for panel in axes[:, column]:
+            panel.locator_params(axis="x", nbins=5)
     for index, name in enumerate(rows):
         axes[index, 0].set_ylabel(AXES[name])
         if name != "ep_return":
