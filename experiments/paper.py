@@ -101,7 +101,7 @@ def scales() -> dict[str, Scale]:
         "Push-Hazard-Point": (4, 32, 50),
         "Push-Pillar-Point": (4, 32, 25),
         "Goal-Hazard-Car": (4, 64, 50),
-        "Goal-Hazard-Doggo": (4, 16, 25),
+        "Goal-Hazard-Doggo": (4, 64, 50),
     }
     slow_2m = {world: (n, 4 * t, episodes) for world, (n, t, episodes) in slow.items()}
     reduced = dataclasses.replace(laptop, num_epochs=64, chunk_epochs=4)
