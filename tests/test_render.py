@@ -100,10 +100,14 @@ def test_the_address_chooses_moment_and_view(replayed, tmp_path):
 
 
 def test_a_page_by_itself_plays(replayed, tmp_path):
-    dom, _ = browse(tmp_path, replayed, address="")
-    frame = re.search(r'<canvas id="world"[^>]*data-frame="(\d+)"', dom)
-    assert frame is not None
-    assert int(frame.group(1)) > 5
+    for seconds in (4, 16, 64):  # on a busy machine the page is slow to begin
+        budget = f"--virtual-time-budget={1000 * seconds}"
+        dom, _ = browse(tmp_path, replayed, budget, address="")
+        frame = re.search(r'<canvas id="world"[^>]*data-frame="(\d+)"', dom)
+        assert frame is not None
+        if int(frame.group(1)) > 5:
+            return
+    pytest.fail(f"it stands at frame {frame.group(1)}")
 
 
 @pytest.mark.parametrize("name", ["Push-Pillar-Car", "DoggoPush2", "PointGoal2"])
