@@ -302,7 +302,7 @@ def by_loudness(runs: Path) -> list[dict[str, Any]]:
 
 
 def render(result: dict[str, Any]) -> str:
-    """The searches, then the finalists on fresh seeds."""
+    """The searches, fitness by loudness, then the rounds of fresh seeds."""
 
     def means(table: list[list[float]], digits: int) -> str:
         return ", ".join(f"{np.mean(row):.{digits}f}" for row in table)
