@@ -167,6 +167,11 @@ def world_size(world: str, scale: Scale) -> tuple[int, int, int]:
     return scale.sizes.get(world, usual)
 
 
+def steps_a_slot(train: TrainConfig) -> int:
+    """Env steps that one slot is trained for."""
+    return train.num_worlds * train.env.num_steps * train.num_epochs
+
+
 def run(figure: Figure, scale: Scale, runs: Path) -> None:
     """Train what the figure lacks, all of it side by side in each world."""
     for world in figure.worlds:
@@ -221,8 +226,7 @@ def scores(trained: Trained) -> dict[str, Any]:
             name: curve([np.take(row[f"{group}/{name}"], own) for row in metrics])
             for name in CURVES
         }
-    train = config.train
-    steps = train.num_worlds * train.env.num_steps * train.num_epochs
+    steps = steps_a_slot(config.train)
     run = {name: facts[name] for name in ("commit", "created", "num_devices")}
     return {"steps_a_slot": steps, "trained": run, "algorithms": result}
 

@@ -220,6 +220,7 @@ def make_card(row: dict[str, Any], config: SearchConfig) -> dict[str, Any]:
         for algorithm, score in row["validation"].items()
     }
     last = ROUNDS[-1]
+    steps = paper.steps_a_slot(paper.scales()[last.scale].train)
     violates = [paper.NAMES[a] for a, s in validation.items() if s["violations"]]
     return {
         "found": f"{row['rule']} search, seed {row['seed']}, stage {row['stage'] + 1}, "
@@ -228,7 +229,7 @@ def make_card(row: dict[str, Any], config: SearchConfig) -> dict[str, Any]:
         "budget": f"{config.env_steps:,} env steps a search, reduced scale",
         "search": {key: row[key] for key in ("cost", "ep_return", "times_trained")},
         "validation": validation,
-        "validated_on": f"training seeds {last.seeds}, 2,048,000 steps each; it was "
+        "validated_on": f"training seeds {last.seeds}, {steps:,} steps each; it was "
         f"chosen among {last.entrants} on these, so they flatter it a little",
         "fails": f"not free of violations under {' and '.join(violates)}"
         if violates
