@@ -9,8 +9,9 @@ already is taken from there.
     python experiments/cost_limits.py collect   # JSON, table, picture of all runs
 
 `--scale reduced` (default) fits a CPU and is no result of the paper's scale, which is
-`--scale paper`; `reduced_2m` trains four times as long. `--smoke` shrinks everything to
-a minute. Runs can be stopped and started again.
+`--scale paper`; `reduced_2m` trains four times as long. `reduced_10m` has the paper's
+worlds and epochs with smaller networks and updates, and wants a GPU. `--smoke` shrinks
+everything to a minute. Runs can be stopped and started again.
 """
 
 import argparse
@@ -43,7 +44,8 @@ class Design(NamedTuple):
       title: in legends and tables.
       cost: terms of the cost bank.
       limit: allowed cost of an episode.
-      theta: file of the intrinsic network's parameters, if `cost` uses it.
+      theta: file of the intrinsic network's parameters, if `cost` uses it; `FOUND`
+        for `Scale.evolved`.
       algorithms: that are trained with it.
     """
 
@@ -56,7 +58,8 @@ class Design(NamedTuple):
 
 COSTS = RESULTS / "reduced" / "costs"
 WITH_NETWORK = "extrinsic+intrinsic"
-EVOLVED = "ic4srl_reduced"  # until a search of full scale finds the paper's IC4SRL
+EVOLVED = "ic4srl_reduced"
+FOUND = "found"
 DESIGNS: dict[str, Design] = {
     "unconstrained": Design("", algorithms=("ppo",)),
     "extrinsic": Design("limit 0"),
@@ -69,8 +72,9 @@ DESIGNS: dict[str, Design] = {
     "margin_2x": Design("margin 2x", "safety_margin_2x"),
     "margin_3x": Design("margin 3x", "safety_margin_3x"),
     "steep": Design("steep network", WITH_NETWORK, theta=COSTS / "steep"),
-    "evolved": Design("evolved", WITH_NETWORK, theta=EVOLVED),
-    "evolved_alone": Design("evolved, w/o extrinsic", "intrinsic", theta=EVOLVED),
+    "evolved": Design("evolved", WITH_NETWORK, theta=FOUND),
+    "evolved_alone": Design("evolved, w/o extrinsic", "intrinsic", theta=FOUND),
+    "evolved_reduced": Design("evolved at 512,000", WITH_NETWORK, theta=EVOLVED),
 }
 
 
@@ -82,20 +86,24 @@ class Scale(NamedTuple):
       seeds: one slot each.
       episodes: fresh ones a policy is scored in.
       sizes: worlds a slot, epochs and episodes of slow worlds.
+      evolved: the cost that was searched for at this scale or the one below it.
     """
 
     train: TrainConfig
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     episodes: int = 200
     sizes: dict[str, tuple[int, int, int]] = {}  # noqa: RUF012
+    evolved: str = EVOLVED
 
 
 def scales() -> dict[str, Scale]:
     """`reduced`: the laptop's update and 512,000 steps a slot, fewer in slow worlds.
 
-    `reduced_2m` is four times as long.
+    `reduced_2m` is four times as long. `reduced_10m` is the `search` preset's learner
+    with the paper's 333 epochs of 30 worlds, 9,990,000 steps a slot.
     """
     laptop, smoke = preset("laptop").train, preset("smoke").train
+    search = preset("search").train
     slow = {
         "Goal-Pillar-Point": (4, 64, 200),
         "Push-Hazard-Point": (4, 32, 50),
@@ -106,10 +114,12 @@ def scales() -> dict[str, Scale]:
     slow_2m = {world: (n, 4 * t, episodes) for world, (n, t, episodes) in slow.items()}
     reduced = dataclasses.replace(laptop, num_epochs=64, chunk_epochs=4)
     longer = dataclasses.replace(reduced, num_epochs=256)
+    longest = dataclasses.replace(search, num_epochs=333, chunk_epochs=37)
     return {
         "reduced": Scale(reduced, sizes=slow),
         "reduced_2m": Scale(longer, sizes=slow_2m),
-        "paper": Scale(preset("paper").train),
+        "reduced_10m": Scale(longest, evolved="ic4srl"),
+        "paper": Scale(preset("paper").train, evolved="ic4srl"),
         "smoke": Scale(smoke, seeds=(0, 1), episodes=2),
     }
 
@@ -147,14 +157,16 @@ def table(world: str, designs: Sequence[str], scale: Scale) -> TableConfig:
         num_worlds=worlds,
         num_epochs=epochs,
     )
-    rows = tuple(method for design in designs for method in methods(design))
+    rows = tuple(row for design in designs for row in methods(design, scale))
     return TableConfig(train, rows, scale.seeds)
 
 
-def methods(design: str) -> tuple[Method, ...]:
+def methods(design: str, scale: Scale) -> tuple[Method, ...]:
     """A design's rows of a table."""
-    cost = DESIGNS[design]
-    theta = None if cost.theta is None else tuple(load_cost(cost.theta).tolist())
+    cost, theta = DESIGNS[design], None
+    if cost.theta is not None:
+        file = scale.evolved if cost.theta == FOUND else cost.theta
+        theta = tuple(load_cost(file).tolist())
     return tuple(
         Method(f"{design}-{name}", name, cost.cost, cost.limit, theta)
         for name in cost.algorithms
@@ -434,7 +446,7 @@ def smooth(values: Sequence[float], width: int = 5) -> np.ndarray:
 def parser(
     description: str | None,
     parts: Iterable[str] = ("run", "collect"),
-    scales: Sequence[str] = ("reduced", "reduced_2m", "paper"),
+    scales: Sequence[str] = ("reduced", "reduced_2m", "reduced_10m", "paper"),
 ) -> argparse.ArgumentParser:
     """The flags of an experiment's script."""
     parser = argparse.ArgumentParser(

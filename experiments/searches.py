@@ -7,14 +7,14 @@
 
 All rules have the same budget and learners, and meet the same layouts. "paper" starts
 from N(0, 5^2) and selects and mutates as the paper does. "guided" starts from costs
-that rise as anything comes nearer (`es.monotone_start`, std 8), ranks candidates that
-return less than 2 an episode behind all others (`es.rank`), and lets no mutation change
-how loud a cost is at a typical place (`es.keep_level`). "raw" is guided with the
-paper's mutations. Reduced scale: 12 candidates, 4 stages, 512,000 steps a slot; 3
-search seeds, 1 for raw. `--smoke` is for tests.
+that rise as anything comes nearer (`es.monotone_start`, std 8), ranks candidates whose
+return is below a floor behind all others (`es.rank`), and lets no mutation change how
+loud a cost is at a typical place (`es.keep_level`). "raw" is guided with the paper's
+mutations. Sizes, seeds and rounds are in `PLANS`; `--scale reduced_10m` wants a GPU,
+`--smoke` is for tests.
 
 What looks best in a search is partly lucky, so the best of all searches go through
-`ROUNDS` of agents with fresh seeds: many of them briefly, the best of these for longer.
+rounds of agents with fresh seeds: many of them briefly, the best of these for longer.
 """
 
 import argparse
@@ -39,17 +39,8 @@ from autocost_jax.methods import Method, TableConfig
 from autocost_jax.rundata import to_json
 from autocost_jax.store import list_stages, read_config, run_facts
 
-FLOOR = "2"
-START = ("--start", "monotone", "--init-std", "8", "--return-floor", FLOOR)
-RULES = {"guided": (*START, "--keep-level"), "paper": (), "raw": START}
-SEEDS = {"guided": (0, 1, 2), "paper": (0, 1, 2), "raw": (0,)}
-SIZE = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "12")
-SIZE += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
-SIZE += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
-SMOKE = ("--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "2")
+SHIPPED = Path("src/autocost_jax/found")
 LOUDNESS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # a step, within 1.5 R of a hazard
-COSTS = paper.COSTS
-FOUND = Path("src/autocost_jax/found")
 
 
 class Round(NamedTuple):
@@ -70,10 +61,68 @@ class Round(NamedTuple):
     episodes: int
 
 
-ROUNDS = (
-    Round("shortlist", 16, "reduced", (200, 201), 100),
-    Round("validation", 4, "reduced_2m", (100, 101, 102, 103, 104), 200),
-)
+class Plan(NamedTuple):
+    """The searches of a scale.
+
+    Attributes:
+      size: flags that all of them share.
+      floor: return that a guided candidate must reach, also in the rounds.
+      rules: flags and seeds of each rule.
+      rounds: what decides about the best of all searches.
+      winner: what it is called in the package.
+      size_text: for the picture.
+    """
+
+    size: tuple[str, ...]
+    floor: float
+    rules: dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
+    rounds: tuple[Round, ...]
+    winner: str
+    size_text: str
+
+
+def guided(floor: float, *more: str) -> tuple[str, ...]:
+    """Flags of a search that wants costs to be useful."""
+    start = ("--start", "monotone", "--init-std", "8")
+    return (*start, "--return-floor", str(floor), *more)
+
+
+FRESH = (100, 101, 102, 103, 104)
+SMALL = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "12")
+SMALL += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
+SMALL += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
+LARGE = ("--preset", "search", "--physics", "closed_form", "--num-stages", "3")
+LARGE += ("--num-epochs", "96", "--chunk-epochs", "8", "--eval-episodes", "1000")
+PLANS = {
+    "reduced": Plan(
+        SMALL,
+        2.0,
+        {
+            "guided": (guided(2.0, "--keep-level"), (0, 1, 2)),
+            "paper": ((), (0, 1, 2)),
+            "raw": (guided(2.0), (0,)),
+        },
+        (
+            Round("shortlist", 16, "reduced", (200, 201), 100),
+            Round("validation", 4, "reduced_2m", FRESH, 200),
+        ),
+        paper.EVOLVED,
+        "12 candidates, 512,000 steps a slot; 80 episodes a dot and algorithm",
+    ),
+    "reduced_10m": Plan(
+        LARGE,
+        4.0,
+        {
+            "guided": (guided(4.0, "--keep-level"), (0,)),
+            "raw": (guided(4.0), (1,)),
+        },
+        (Round("validation", 8, "reduced_10m", FRESH, 200),),
+        "ic4srl",
+        "50 candidates, 2,880,000 steps a slot; 300 episodes a dot and algorithm",
+    ),
+}
+SMOKE = ("--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "2")
+PLANS["smoke"] = PLANS["reduced"]._replace(size=SMOKE)
 
 
 def folder(runs: Path, rule: str, seed: int) -> Path:
@@ -83,26 +132,26 @@ def folder(runs: Path, rule: str, seed: int) -> Path:
 
 def run(args: argparse.Namespace) -> None:
     """Each search as a user starts it; finished ones are kept, others continued."""
-    for rule, flags in RULES.items():
-        for seed in SEEDS[rule][:1] if args.smoke else SEEDS[rule]:
+    plan = PLANS[args.scale]
+    for rule, (flags, seeds) in plan.rules.items():
+        for seed in seeds[:1] if args.smoke else seeds:
             out = folder(args.runs, rule, seed)
             if (out / "report" / "index.html").exists():
                 continue
             command = [sys.executable, "-m", "autocost_jax.evolve", "--out", str(out)]
-            size = SMOKE if args.smoke else SIZE
-            fresh = (*size, *flags, "--seed", str(seed))
+            fresh = (*plan.size, *flags, "--seed", str(seed))
             more = ("--resume",) if (out / "config.yaml").exists() else fresh
             subprocess.run([*command, *more], check=True)
 
 
-def finished(runs: Path) -> list[tuple[str, int, Path]]:
+def finished(runs: Path, plan: Plan) -> list[tuple[str, int, Path]]:
     """Rule, seed and directory of each finished search."""
-    known = [(rule, seed) for rule in RULES for seed in SEEDS[rule]]
+    known = [(rule, s) for rule, (_, seeds) in plan.rules.items() for s in seeds]
     paths = [(rule, seed, folder(runs, rule, seed)) for rule, seed in known]
     return [row for row in paths if (row[2] / "cost.json").exists()]
 
 
-def candidates(runs: Path) -> list[dict[str, Any]]:
+def candidates(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     """What all searches have found, best first, ranked as one population.
 
     The guided search's order: useful ones first, of them the safest. An elite that was
@@ -110,7 +159,7 @@ def candidates(runs: Path) -> list[dict[str, Any]]:
     does not carry it.
     """
     found: dict[bytes, list[dict[str, Any]]] = {}
-    for rule, seed, path in finished(runs):
+    for rule, seed, path in finished(runs, plan):
         for stage, file in list_stages(path).items():
             arrays = load_arrays(file)
             for index, theta in enumerate(arrays["theta"]):
@@ -127,27 +176,27 @@ def candidates(runs: Path) -> list[dict[str, Any]]:
         }
         for group in found.values()
     ]
-    order = guided_order(
-        [row["cost"] for row in rows], [row["ep_return"] for row in rows]
-    )
-    return [rows[i] for i in order]
+    costs, returns = ([row[key] for row in rows] for key in ("cost", "ep_return"))
+    return [rows[i] for i in guided_order(costs, returns, plan.floor)]
 
 
-def guided_order(costs: Sequence[float], returns: Sequence[float]) -> list[int]:
+def guided_order(
+    costs: Sequence[float], returns: Sequence[float], floor: float
+) -> list[int]:
     """Indices, best first, as the guided search ranks."""
     fitness = Fitness(jnp.asarray(costs), jnp.asarray(returns))
-    return [int(i) for i in rank(fitness, return_floor=float(FLOOR))]
+    return [int(i) for i in rank(fitness, return_floor=floor)]
 
 
 def validate(args: argparse.Namespace) -> None:
     """All rounds, one after the other."""
-    for index in range(len(ROUNDS)):
-        name, _, scale_name, seeds, episodes = ROUNDS[index]
+    plan = PLANS[args.scale]
+    for index, (name, _, scale_name, seeds, episodes) in enumerate(plan.rounds):
         scale = paper.scales()["smoke" if args.smoke else scale_name]
         config = paper.table(paper.TRAINING_WORLD, ["extrinsic"], scale)
         methods = tuple(
             Method(f"{i}-{algorithm}", algorithm, paper.WITH_NETWORK, 0.0, theta)
-            for i, row in enumerate(entrants(args.runs, index))
+            for i, row in enumerate(entrants(args.runs, plan, index))
             for algorithm in paper.BOTH
             for theta in [tuple(row["theta"].tolist())]
         )
@@ -157,22 +206,23 @@ def validate(args: argparse.Namespace) -> None:
         run_if_needed(config, args.runs / name, episodes)
 
 
-def entrants(runs: Path, index: int) -> list[dict[str, Any]]:
+def entrants(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
     """Who takes part in a round: the best of the round before, or of the searches."""
-    ranked = scored(runs, index - 1) if index else candidates(runs)
-    return ranked[: ROUNDS[index].entrants]
+    ranked = scored(runs, plan, index - 1) if index else candidates(runs, plan)
+    return ranked[: plan.rounds[index].entrants]
 
 
-def scored(runs: Path, index: int) -> list[dict[str, Any]]:
+def scored(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
     """The entrants of a round that was run with their scores in it, best first.
 
     Means over both algorithms, ranked as the guided search ranks.
     """
-    path = runs / ROUNDS[index].name
+    name = plan.rounds[index].name
+    path = runs / name
     config = read_config(path, TableConfig)[0]
     rows = json.loads((path / "evaluation.json").read_text())["rows"]
     result = []
-    for i, row in enumerate(entrants(runs, index)):
+    for i, row in enumerate(entrants(runs, plan, index)):
         theta = np.asarray(config.methods[2 * i].theta, np.float32)
         if not np.array_equal(theta, row["theta"]):
             raise SystemExit(f"{path} was made with other searches: remove it")
@@ -182,34 +232,32 @@ def scored(runs: Path, index: int) -> list[dict[str, Any]]:
             )
             for algorithm in paper.BOTH
         }
-        result.append(row | {ROUNDS[index].name: scores})
+        result.append(row | {name: scores})
 
     def means(key: str) -> list[float]:
-        scores = [row[ROUNDS[index].name].values() for row in result]
+        scores = [row[name].values() for row in result]
         return [float(np.mean([s[key]["mean"] for s in row])) for row in scores]
 
-    return [result[i] for i in guided_order(means("cost"), means("return"))]
+    order = guided_order(means("cost"), means("return"), plan.floor)
+    return [result[i] for i in order]
 
 
 def ship(args: argparse.Namespace) -> None:
-    """Write the winner and the runners-up: COSTS, and the winner into the package.
-
-    Its name says that the search was of reduced scale.
-    """
-    where = args.results / "costs" if args.smoke else COSTS
+    """Write the winner and three runners-up, and the winner into the package."""
+    plan, where = PLANS[args.scale], args.results / "costs"
     where.mkdir(parents=True, exist_ok=True)
-    for place, row in enumerate(scored(args.runs, len(ROUNDS) - 1)):
+    for place, row in enumerate(scored(args.runs, plan, len(plan.rounds) - 1)[:4]):
         config, facts = read_config(folder(args.runs, row["rule"], row["seed"]))
-        name = paper.EVOLVED if place == 0 else f"runner_up_{place}"
-        card = make_card(row, config) | {"commit": facts["commit"]}
+        name = f"runner_up_{place}" if place else plan.winner
+        card = make_card(row, plan, config) | {"commit": facts["commit"]}
         save_cost(where / name, row["theta"], to_json(card))
         if place == 0 and not args.smoke:
-            FOUND.mkdir(exist_ok=True)
-            save_cost(FOUND / name, row["theta"], to_json(card))
+            SHIPPED.mkdir(exist_ok=True)
+            save_cost(SHIPPED / name, row["theta"], to_json(card))
         print(name, card["found"], json.dumps(card["validation"]))
 
 
-def make_card(row: dict[str, Any], config: SearchConfig) -> dict[str, Any]:
+def make_card(row: dict[str, Any], plan: Plan, config: SearchConfig) -> dict[str, Any]:
     """How a cost was found, its scores on fresh seeds, and where it fails."""
     validation = {
         algorithm: {
@@ -219,7 +267,7 @@ def make_card(row: dict[str, Any], config: SearchConfig) -> dict[str, Any]:
         }
         for algorithm, score in row["validation"].items()
     }
-    last = ROUNDS[-1]
+    last = plan.rounds[-1]
     steps = paper.steps_a_slot(paper.scales()[last.scale].train)
     violates = [paper.NAMES[a] for a, s in validation.items() if s["violations"]]
     return {
@@ -239,8 +287,8 @@ def make_card(row: dict[str, Any], config: SearchConfig) -> dict[str, Any]:
 
 def collect(args: argparse.Namespace) -> None:
     """JSON, table, the evolution's picture, and the heat map of the winner."""
-    searches = []
-    for rule, seed, path in finished(args.runs):
+    plan, searches = PLANS[args.scale], []
+    for rule, seed, path in finished(args.runs, plan):
         stages = [load_arrays(file) for file in list_stages(path).values()]
         searches.append(
             {
@@ -258,16 +306,17 @@ def collect(args: argparse.Namespace) -> None:
         "paper": "The population's mean cost falls, the best candidates' most; none is "
         "at zero in stage 1, more and more later.",
         "scale": args.scale,
-        "command": "python experiments/searches.py run",
+        "command": f"python experiments/searches.py run --scale {args.scale}",
         "facts": facts,
         "searches": searches,
-        "loudness": by_loudness(args.runs),
+        "size": plan.size_text,
+        "loudness": by_loudness(args.runs, plan),
     }
-    for index, part in enumerate(ROUNDS):
+    for index, part in enumerate(plan.rounds):
         if (args.runs / part.name / "evaluation.json").exists():
             result[part.name] = [
                 {key: value for key, value in row.items() if key != "theta"}
-                for row in scored(args.runs, index)
+                for row in scored(args.runs, plan, index)
             ]
     result = json.loads(json.dumps(to_json(result), allow_nan=False))
     file = paper.write(result, "evolution", args.results)
@@ -277,14 +326,14 @@ def collect(args: argparse.Namespace) -> None:
     print(file)
 
 
-def by_loudness(runs: Path) -> list[dict[str, Any]]:
+def by_loudness(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     """Mean fitness of all that was trained, by the cost of a step near a hazard.
 
     That of the states which the candidate's own agents have visited.
     """
     tables = [
         load_arrays(file)
-        for _, _, path in finished(runs)
+        for _, _, path in finished(runs, plan)
         for file in list_stages(path).values()
     ]
     if not tables:
@@ -331,18 +380,18 @@ def render(result: dict[str, Any]) -> str:
             f"| {row['low']} to {row['high']} | {row['count']} | {row['cost']:.1f} "
             f"| {row['return']:.1f} |"
         )
-    for part in ROUNDS:
-        if part.name in result:
-            lines += ["", *render_round(part, result[part.name])]
+    for name in ("shortlist", "validation"):
+        if name in result:
+            lines += ["", *render_round(name, result[name])]
     return "\n".join(lines) + "\n"
 
 
-def render_round(part: Round, rows: list[dict[str, Any]]) -> list[str]:
+def render_round(name: str, rows: list[dict[str, Any]]) -> list[str]:
     """The entrants of a round, best first."""
     columns = ("return (95 %)", "cost (95 %)", "violating (at most)")
     heads = [f"{paper.NAMES[a]}: {c}" for a in paper.BOTH for c in columns]
     lines = [
-        f"| {part.name} | search: cost, return | {' | '.join(heads)} |",
+        f"| {name} | search: cost, return | {' | '.join(heads)} |",
         "|---" * (2 + len(heads)) + "|",
     ]
     for row in rows:
@@ -350,7 +399,7 @@ def render_round(part: Round, rows: list[dict[str, Any]]) -> list[str]:
             f"{row['rule']} {row['seed']}, stage {row['stage'] + 1}, {row['index']}",
             f"{row['cost']:.2f}, {row['ep_return']:.1f}",
         ]
-        for score in row[part.name].values():
+        for score in row[name].values():
             gain, cost = score["return"], score["cost"]
             cells += [
                 f"{gain['mean']:.1f} ({gain['low']:.1f} to {gain['high']:.1f})",
@@ -365,7 +414,7 @@ def draw(result: dict[str, Any], file: Path) -> None:
     """The paper's scatter: a dot a candidate, best and mean of each stage; by rule."""
     from matplotlib.figure import Figure
 
-    rules = [r for r in RULES if any(s["rule"] == r for s in result["searches"])]
+    rules = list(dict.fromkeys(search["rule"] for search in result["searches"]))
     if not rules:
         return
     size = (1 + 3.8 * len(rules), 5.5)
@@ -393,11 +442,8 @@ def draw(result: dict[str, Any], file: Path) -> None:
     axes[0, 0].set_ylabel("extrinsic cost an episode")
     axes[1, 0].set_ylabel("return an episode")
     axes[0, 0].legend(fontsize=6)
-    picture.suptitle(
-        f"Evolution, {result['scale']} scale: 12 candidates, 512,000 steps a slot; "
-        "80 episodes a dot and algorithm",
-        fontsize=9,
-    )
+    title = f"Evolution, {result['scale']} scale: {result['size']}"
+    picture.suptitle(title, fontsize=9)
     picture.savefig(file, dpi=130)
 
 
@@ -405,7 +451,7 @@ def draw_heat_map(args: argparse.Namespace) -> None:
     """The shipped cost around one hazard, as in the paper."""
     from autocost_jax.report_assets.figures import heat_map
 
-    winner = (args.results / "costs" if args.smoke else COSTS) / paper.EVOLVED
+    winner = args.results / "costs" / PLANS[args.scale].winner
     if winner.with_suffix(".npz").exists():
         picture = heat_map(np.asarray(load_cost(winner)), radius=0.3)
         picture.savefig(args.results / "heat_map.png", dpi=130)
@@ -414,5 +460,7 @@ def draw_heat_map(args: argparse.Namespace) -> None:
 PARTS = {"run": run, "validate": validate, "ship": ship, "collect": collect}
 
 if __name__ == "__main__":
-    options = paper.arguments(paper.parser(__doc__, PARTS, scales=("reduced",)))
+    options = paper.arguments(
+        paper.parser(__doc__, PARTS, scales=("reduced", "reduced_10m"))
+    )
     PARTS[options.part](options)

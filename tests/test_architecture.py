@@ -19,6 +19,7 @@ MAX_FUNCTION, MAX_MODULE = 60, 350  # lines that are not docstring
 # whose members may import each other.
 ORDER = (
     "records",
+    "precision",
     "arrays",
     "cluster",
     "checks",

@@ -32,6 +32,7 @@ computing_time = load_script("experiments/computing_time")
 paper = load_script("experiments/paper")
 searches = load_script("experiments/searches")
 transfer = load_script("experiments/transfer")
+PLAN = searches.PLANS["smoke"]
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -224,14 +225,14 @@ def write_search(runs, costs, returns):
 def write_round(runs, index, scores):
     """Scores of each entrant, (return, cost, violating of 100) by algorithm."""
     methods, rows = [], []
-    for i, row_of in enumerate(searches.entrants(runs, index)):
+    for i, row_of in enumerate(searches.entrants(runs, PLAN, index)):
         theta = tuple(row_of["theta"].tolist())
         for algorithm, score in zip(paper.BOTH, scores[i], strict=True):
             label = f"{i}-{algorithm}"
             methods.append(Method(label, algorithm, paper.WITH_NETWORK, 0.0, theta))
             rows.append({"method": label, "seed": 100} | row(*score))
     config = TableConfig(preset("smoke").train, tuple(methods), (100,))
-    with RunDir.create(runs / searches.ROUNDS[index].name, config) as run:
+    with RunDir.create(runs / PLAN.rounds[index].name, config) as run:
         run.write_json("evaluation", {"episodes": 100, "rows": rows})
 
 
@@ -241,12 +242,12 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     returns = [[-3.0, 5.0, 1.0, 9.0], [7.0, 6.0, 5.0, 4.0]]
     runs = tmp_path / "runs"
     theta = write_search(runs, costs, returns)
-    ranked = searches.candidates(runs)
+    ranked = searches.candidates(runs, PLAN)
     assert [row["index"] for row in ranked] == [1, 1, 2, 3, 3, 2, 0]
     assert (ranked[0]["cost"], ranked[0]["times_trained"]) == (2.0, 2)
     worse = [[(9.0, 4.0 + i, 60)] * 2 for i in range(5)]
     write_round(runs, 0, [worse[0], *[[(3.0, 2.0, 50)] * 2] * 2, *worse[1:]])
-    found = searches.entrants(runs, 1)
+    found = searches.entrants(runs, PLAN, 1)
     assert [row["index"] for row in found] == [1, 2, 1, 3]
     timid, best = [(1.0, 0.0, 0)] * 2, [(4.0, 0.1, 3), (3.0, 0.0, 0)]
     write_round(runs, 1, [timid, best, *worse[:2]])

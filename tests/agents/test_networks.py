@@ -126,3 +126,14 @@ def test_the_critics_own_steps_use_the_precision(precision, expect):
     wide = [line for line in products if "5" in line]  # those that see observations
     assert wide
     assert all(expect in line for line in wide)
+
+
+def test_acting_and_judging_use_full_precision():
+    """Also outside an update, where a GPU would round products by itself."""
+    networks = make_networks(AgentConfig(hidden_sizes=(8,)), 5, 2)
+    policy, critic = networks.init(jax.random.key(0))
+    for fn, params in ((networks.distribution, policy), (networks.values, critic)):
+        text = jax.jit(fn).lower(params, jnp.ones((7, 5))).as_text()
+        products = [line for line in text.splitlines() if "dot_general" in line]
+        assert products
+        assert all("HIGHEST" in line for line in products)

@@ -72,6 +72,16 @@ def test_step_keeps_every_type(x64):
         assert before.cost_inputs.constraint_lidar.shape == (8,)
 
 
+def test_products_are_of_full_precision(default_env):
+    """Where a GPU would round them by itself."""
+    env = default_env.env
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    text = jax.jit(env.step).lower(state, jnp.zeros(2)).as_text()
+    products = [line for line in text.splitlines() if "dot_general" in line]
+    assert products
+    assert all("HIGHEST" in line for line in products)
+
+
 def test_reset_is_fresh_and_consistent(default_env, worlds):
     state = worlds
     assert len(np.unique(np.asarray(state.layout.goal_xy), axis=0)) == NUM_WORLDS

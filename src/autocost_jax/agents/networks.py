@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from autocost_jax.config import AgentConfig, Precision
+from autocost_jax.precision import full_precision
 from autocost_jax.records import Key
 
 Params = Any
@@ -129,12 +130,11 @@ def make_networks(
             output: Any = network.apply({"params": one}, obs)
             return jnp.squeeze(output, -1)
 
-        if precision == "tensorfloat32":
-            with jax.default_matmul_precision("tensorfloat32"):
-                return jax.vmap(value)(params)
-        return jax.vmap(value)(params)
+        products = "tensorfloat32" if precision == "tensorfloat32" else "highest"
+        with jax.default_matmul_precision(products):
+            return jax.vmap(value)(params)
 
-    return Networks(init, distribution, values)
+    return Networks(init, full_precision(distribution), values)
 
 
 def sample(key: Key, mean: jax.Array, log_std: jax.Array) -> jax.Array:

@@ -18,6 +18,7 @@ from autocost_jax.envs.constraints import Constraint, distances_to, make_constra
 from autocost_jax.envs.sensors import flatten, lidar, slices
 from autocost_jax.envs.tasks import Task, make_task
 from autocost_jax.envs.world import World, make_world
+from autocost_jax.precision import full_precision
 from autocost_jax.records import (
     Bodies,
     CostInputs,
@@ -101,9 +102,9 @@ def make_env(name_or_config: str | EnvConfig) -> Env:
     lidar_sizes = dict.fromkeys(lidar_names, config.lidar_num_bins)
     obs_slices = slices({**world.sensor_sizes, **lidar_sizes})
     return Env(
-        reset=functools.partial(_reset, parts),
-        reset_to=functools.partial(_reset_to, parts),
-        step=functools.partial(_step, parts),
+        reset=full_precision(functools.partial(_reset, parts)),
+        reset_to=full_precision(functools.partial(_reset_to, parts)),
+        step=full_precision(functools.partial(_step, parts)),
         observation_size=max(part.stop for part in obs_slices.values()),
         action_size=world.action_size,
         episode_length=config.num_steps,
