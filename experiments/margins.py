@@ -14,7 +14,14 @@ FIGURE = Figure(
     paper=(
         "3x and the evolved cost reach zero; the evolved cost keeps much more return."
     ),
-    designs=("extrinsic", "margin_2x", "margin_3x", "steep", "evolved"),
+    designs=(
+        "extrinsic",
+        "margin_2x",
+        "margin_3x",
+        "steep",
+        "evolved",
+        "evolved_reduced",
+    ),
 )
 
 if __name__ == "__main__":

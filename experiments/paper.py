@@ -187,11 +187,23 @@ def steps_a_slot(train: TrainConfig) -> int:
 def run(figure: Figure, scale: Scale, runs: Path) -> None:
     """Train what the figure lacks, all of it side by side in each world."""
     for world in figure.worlds:
-        designs = [d for d in figure.designs if find(runs, world, d, scale) is None]
+        wanted = distinct(figure.designs, scale)
+        designs = [d for d in wanted if find(runs, world, d, scale) is None]
         if designs:
             config = table(world, designs, scale)
             episodes = world_size(world, scale)[2]
             run_if_needed(config, runs / world / "+".join(designs), episodes)
+
+
+def distinct(designs: Sequence[str], scale: Scale) -> list[str]:
+    """Designs without those that are another one at this scale."""
+    contents = [[content(m) for m in methods(d, scale)] for d in designs]
+    return [d for i, d in enumerate(designs) if contents[i] not in contents[:i]]
+
+
+def content(method: Method) -> Method:
+    """A method whatever it is called."""
+    return dataclasses.replace(method, label="")
 
 
 class Trained(NamedTuple):
@@ -208,10 +220,6 @@ class Trained(NamedTuple):
 
 def find(runs: Path, world: str, design: str, scale: Scale) -> Trained | None:
     """The finished run that holds a design, whatever else was trained in it."""
-
-    def content(method: Method) -> Method:
-        return dataclasses.replace(method, label="")
-
     wanted = table(world, [design], scale)
     for file in sorted((runs / world).glob("*/evaluation.json")):
         config = read_config(file.parent, TableConfig)[0]
@@ -239,7 +247,8 @@ def scores(trained: Trained) -> dict[str, Any]:
             for name in CURVES
         }
     steps = steps_a_slot(config.train)
-    run = {name: facts[name] for name in ("commit", "created", "num_devices")}
+    names = ("commit", "created", "device", "num_devices")
+    run = {name: facts[name] for name in names} | {"jax": facts["versions"]["jax"]}
     return {"steps_a_slot": steps, "trained": run, "algorithms": result}
 
 
@@ -305,7 +314,7 @@ def collect(figure: Figure, scale_name: str, runs: Path, results: Path) -> None:
     panels = {
         world: {
             design: scores(trained)
-            for design in figure.designs
+            for design in distinct(figure.designs, scale)
             if (trained := find(runs, world, design, scale)) is not None
         }
         for world in figure.worlds

@@ -23,7 +23,7 @@ import itertools
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,7 +66,9 @@ class Plan(NamedTuple):
 
     Attributes:
       size: flags that all of them share.
-      floor: return that a guided candidate must reach, also in the rounds.
+      judge: what stands for both algorithms where the best of all searches are ranked:
+        "mean", or "worst" for the higher cost and the lower return.
+      floor: return that a cost must reach there.
       rules: flags and seeds of each rule.
       rounds: what decides about the best of all searches.
       winner: what it is called in the package.
@@ -74,6 +76,7 @@ class Plan(NamedTuple):
     """
 
     size: tuple[str, ...]
+    judge: str
     floor: float
     rules: dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
     rounds: tuple[Round, ...]
@@ -96,6 +99,7 @@ LARGE += ("--num-epochs", "96", "--chunk-epochs", "8", "--eval-episodes", "1000"
 PLANS = {
     "reduced": Plan(
         SMALL,
+        "mean",
         2.0,
         {
             "guided": (guided(2.0, "--keep-level"), (0, 1, 2)),
@@ -111,12 +115,10 @@ PLANS = {
     ),
     "reduced_10m": Plan(
         LARGE,
-        4.0,
-        {
-            "guided": (guided(4.0, "--keep-level"), (0,)),
-            "raw": (guided(4.0), (1,)),
-        },
-        (Round("validation", 8, "reduced_10m", FRESH, 200),),
+        "worst",
+        2.5,
+        {"guided": (guided(4.0, "--keep-level"), (0,))},
+        (Round("validation", 9, "reduced_10m", FRESH, 200),),
         "ic4srl",
         "50 candidates, 2,880,000 steps a slot; 300 episodes a dot and algorithm",
     ),
@@ -155,17 +157,23 @@ def candidates(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     """What all searches have found, best first, ranked as one population.
 
     The guided search's order: useful ones first, of them the safest. An elite that was
-    trained again counts once, with the mean of its fitness, so that one lucky stage
+    trained again counts once, with the mean of its scores, so that one lucky stage
     does not carry it.
     """
+    worst = plan.judge == "worst"
     found: dict[bytes, list[dict[str, Any]]] = {}
     for rule, seed, path in finished(runs, plan):
         for stage, file in list_stages(path).items():
             arrays = load_arrays(file)
             for index, theta in enumerate(arrays["theta"]):
                 row = {"rule": rule, "seed": seed, "stage": stage, "index": index}
-                row |= {"theta": theta, "cost": float(arrays["cost"][index])}
-                row["ep_return"] = float(arrays["ep_return"][index])
+                cost, ep_return = (
+                    arrays[f"scores/{name}"][:, index]
+                    for name in ("ep_cost", "ep_return")
+                )
+                row["theta"] = theta
+                row["cost"] = float(cost.max() if worst else cost.mean())
+                row["ep_return"] = float(ep_return.min() if worst else ep_return.mean())
                 found.setdefault(theta.tobytes(), []).append(row)
     rows = [
         group[0]
@@ -215,7 +223,7 @@ def entrants(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
 def scored(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
     """The entrants of a round that was run with their scores in it, best first.
 
-    Means over both algorithms, ranked as the guided search ranks.
+    Both algorithms together as `Plan.judge` says, ranked as the guided search ranks.
     """
     name = plan.rounds[index].name
     path = runs / name
@@ -234,11 +242,12 @@ def scored(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
         }
         result.append(row | {name: scores})
 
-    def means(key: str) -> list[float]:
+    def judged(key: str, worst: Callable[..., float]) -> list[float]:
+        judge = worst if plan.judge == "worst" else np.mean
         scores = [row[name].values() for row in result]
-        return [float(np.mean([s[key]["mean"] for s in row])) for row in scores]
+        return [float(judge([s[key]["mean"] for s in row])) for row in scores]
 
-    order = guided_order(means("cost"), means("return"), plan.floor)
+    order = guided_order(judged("cost", max), judged("return", min), plan.floor)
     return [result[i] for i in order]
 
 
@@ -275,6 +284,8 @@ def make_card(row: dict[str, Any], plan: Plan, config: SearchConfig) -> dict[str
         f"candidate {row['index']}",
         "environment": config.train.env.name,
         "budget": f"{config.env_steps:,} env steps a search, reduced scale",
+        "judged_by": f"the {plan.judge} of the two algorithms; a return of at least "
+        f"{plan.floor:g}, then the cost",
         "search": {key: row[key] for key in ("cost", "ep_return", "times_trained")},
         "validation": validation,
         "validated_on": f"training seeds {last.seeds}, {steps:,} steps each; it was "

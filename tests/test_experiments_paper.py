@@ -76,6 +76,23 @@ def test_a_longer_scale_differs_in_epochs_alone():
     assert paper.world_size("Goal-Hazard-Car", long) == (4, 256, 50)
 
 
+def test_a_design_that_is_another_one_at_a_scale_is_left_out():
+    designs = ["steep", "evolved", "evolved_reduced"]
+    reduced, long = (paper.scales()[name] for name in ("reduced", "reduced_10m"))
+    assert paper.distinct(designs, reduced) == ["steep", "evolved"]
+    assert paper.distinct(designs, long) == designs
+
+
+def test_the_longest_reduced_scale_has_the_steps_of_the_paper():
+    long, full = (paper.scales()[name] for name in ("reduced_10m", "paper"))
+    trains = [
+        paper.table("Goal-Hazard-Point", ["extrinsic"], s).train for s in (long, full)
+    ]
+    assert paper.steps_a_slot(trains[0]) == paper.steps_a_slot(trains[1]) == 9_990_000
+    assert trains[0].num_worlds == trains[1].num_worlds == 30
+    assert trains[0].agent == preset("search").train.agent  # smaller
+
+
 def test_the_tables_of_the_readme_are_those_of_the_results():
     text = (ROOT / "experiments" / "README.md").read_text()
     blocks = re.findall(
@@ -216,6 +233,8 @@ def write_search(runs, costs, returns):
                     "cost": np.float32(costs[stage]),
                     "ep_return": np.float32(returns[stage]),
                     "scores/intrinsic_near": near,
+                    "scores/ep_cost": np.tile(np.float32(costs[stage]), (2, 1)),
+                    "scores/ep_return": np.tile(np.float32(returns[stage]), (2, 1)),
                 },
             )
         run.write_cost({"theta": theta[0, 0]}, {"search_cost": 0.0})
