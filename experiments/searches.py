@@ -10,8 +10,9 @@ from N(0, 5^2) and selects and mutates as the paper does. "guided" starts from c
 that rise as anything comes nearer (`es.monotone_start`, std 8), ranks candidates whose
 return is below a floor behind all others (`es.rank`), and lets no mutation change how
 loud a cost is at a typical place (`es.keep_level`). "raw" is guided with the paper's
-mutations. Sizes, seeds and rounds are in `PLANS`; `--scale reduced_10m` wants a GPU,
-`--smoke` is for tests.
+mutations; "worst" is guided and judges a candidate by the worse of its two agents, not
+by their mean. Sizes, seeds and rounds are in `PLANS`; `--scale reduced_10m` wants a
+GPU, `--smoke` is for tests.
 
 What looks best in a search is partly lucky, so the best of all searches go through
 rounds of agents with fresh seeds: many of them briefly, the best of these for longer.
@@ -23,7 +24,7 @@ import itertools
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,7 +71,8 @@ class Plan(NamedTuple):
         "mean", or "worst" for the higher cost and the lower return.
       floor: return that a cost must reach there.
       rules: flags and seeds of each rule.
-      rounds: what decides about the best of all searches.
+      entered: the rules whose costs take part in the rounds.
+      rounds: what decides about the best of them.
       winner: what it is called in the package.
       size_text: for the picture.
     """
@@ -79,6 +81,7 @@ class Plan(NamedTuple):
     judge: str
     floor: float
     rules: dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
+    entered: tuple[str, ...]
     rounds: tuple[Round, ...]
     winner: str
     size_text: str
@@ -105,7 +108,9 @@ PLANS = {
             "guided": (guided(2.0, "--keep-level"), (0, 1, 2)),
             "paper": ((), (0, 1, 2)),
             "raw": (guided(2.0), (0,)),
+            "worst": (guided(2.0, "--keep-level", "--judge-by", "worst"), (0, 1, 2)),
         },
+        ("guided", "paper", "raw"),
         (
             Round("shortlist", 16, "reduced", (200, 201), 100),
             Round("validation", 4, "reduced_2m", FRESH, 200),
@@ -118,6 +123,7 @@ PLANS = {
         "worst",
         2.5,
         {"guided": (guided(4.0, "--keep-level"), (0,))},
+        ("guided",),
         (Round("validation", 9, "reduced_10m", FRESH, 200),),
         "ic4srl",
         "50 candidates, 2,880,000 steps a slot; 300 episodes a dot and algorithm",
@@ -163,6 +169,8 @@ def candidates(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     worst = plan.judge == "worst"
     found: dict[bytes, list[dict[str, Any]]] = {}
     for rule, seed, path in finished(runs, plan):
+        if rule not in plan.entered:
+            continue
         for stage, file in list_stages(path).items():
             arrays = load_arrays(file)
             for index, theta in enumerate(arrays["theta"]):
@@ -305,8 +313,7 @@ def collect(args: argparse.Namespace) -> None:
             {
                 "rule": rule,
                 "seed": seed,
-                "cost": [stage["cost"].round(4).tolist() for stage in stages],
-                "return": [stage["ep_return"].round(4).tolist() for stage in stages],
+                **{name: [r.tolist() for r in rows] for name, rows in both(stages)},
                 "best": json.loads((path / "cost.json").read_text()),
             }
         )
@@ -321,6 +328,7 @@ def collect(args: argparse.Namespace) -> None:
         "facts": facts,
         "searches": searches,
         "size": plan.size_text,
+        "floor": plan.floor,
         "loudness": by_loudness(args.runs, plan),
     }
     for index, part in enumerate(plan.rounds):
@@ -337,6 +345,16 @@ def collect(args: argparse.Namespace) -> None:
     print(file)
 
 
+def both(stages: Sequence[dict[str, Any]]) -> Iterator[tuple[str, list[np.ndarray]]]:
+    """Cost and return of each stage's candidates, by mean and by the worse agent."""
+    for name, source, worst in (
+        ("cost", "scores/ep_cost", np.max),
+        ("return", "scores/ep_return", np.min),
+    ):
+        yield name, [np.mean(stage[source], 0).round(4) for stage in stages]
+        yield f"worst_{name}", [worst(stage[source], 0).round(4) for stage in stages]
+
+
 def by_loudness(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     """Mean fitness of all that was trained, by the cost of a step near a hazard.
 
@@ -344,7 +362,8 @@ def by_loudness(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     """
     tables = [
         load_arrays(file)
-        for _, _, path in finished(runs, plan)
+        for rule, _, path in finished(runs, plan)
+        if rule in plan.entered
         for file in list_stages(path).values()
     ]
     if not tables:
@@ -370,16 +389,24 @@ def render(result: dict[str, Any]) -> str:
 
     lines = [
         "| rule, seed | mean cost of each stage | best cost of each stage "
-        "| mean return of each stage | at zero, of each stage |",
-        "|---|---|---|---|---|",
+        "| mean return of each stage | at zero, of each stage "
+        f"| both agents return {result['floor']:g} | lowest worse cost of these |",
+        "|---|---|---|---|---|---|---|",
     ]
     for search in result["searches"]:
         best = ", ".join(f"{min(stage):.2f}" for stage in search["cost"])
         zero = ", ".join(str(sum(c <= 0 for c in stage)) for stage in search["cost"])
+        worse = zip(search["worst_cost"], search["worst_return"], strict=True)
+        useful = [
+            [c for c, gain in zip(*stage, strict=True) if gain >= result["floor"]]
+            for stage in worse
+        ]
         lines.append(
             f"| {search['rule']}, {search['seed']} "
             f"| {means(search['cost'], 2)} | {best} "
-            f"| {means(search['return'], 1)} | {zero} |"
+            f"| {means(search['return'], 1)} | {zero} "
+            f"| {', '.join(str(len(costs)) for costs in useful)} "
+            f"| {', '.join(f'{min(c):.2f}' if c else '-' for c in useful)} |"
         )
     lines += [
         "",

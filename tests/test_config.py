@@ -141,6 +141,7 @@ BAD = {
         "start": ("uniform", ""),
         "keep_level": (1, "yes"),
         "return_floor": FINITE,
+        "judge_by": ("best", ""),
     },
 }
 CASES = [

@@ -291,6 +291,16 @@ def test_a_frozen_agent_costs_everything():
     assert result.order.tolist() == [1, 2, 3, 0]
 
 
+def test_a_candidate_can_be_judged_by_its_worst_algorithm():
+    cost = jnp.zeros((6, 2, 4)).at[:, 0].set(1.0).at[:, 1].set(3.0)
+    for judge, expect in (("mean", (2.0, 3.0)), ("worst", (3.0, 2.0))):
+        config = dataclasses.replace(CONFIG, judge_by=judge)
+        history = make_history(cost, cost + 1.0)
+        alive = jnp.zeros((2, 4), bool)
+        fitness = stage_result(config, jnp.zeros((4, 41)), history, alive).fitness
+        assert (float(fitness.cost[0]), float(fitness.ep_return[0])) == expect
+
+
 def poison(searcher, broken):
     """A state before the first chunk, with NaN parameters in some slots."""
     state = init_search(searcher)

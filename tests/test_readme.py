@@ -152,6 +152,7 @@ def test_the_tables_are_those_of_the_committed_json(script, result):
         "--process-id",
         "--start",
         "--return-floor",
+        "--judge-by",
     ],
 )
 def test_flags_of_the_readme_exist(flag, capsys):

@@ -22,6 +22,7 @@ from autocost_jax.env_config import EnvConfig
 Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
 Start = Literal["normal", "monotone"]
+Judge = Literal["mean", "worst"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 THETA_SIZE = 41
 
@@ -172,11 +173,13 @@ class SearchConfig:
     a mean extrinsic cost <= `zero_tolerance` over those episodes.
     `selection="random"` replaces the ranking by a random choice: the control.
 
-    Three options of ours beside the paper's rule. `start="monotone"` draws first costs
+    Four options of ours beside the paper's rule. `start="monotone"` draws first costs
     that rise as anything comes nearer and are small at a typical place, see
     `es.monotone_start`. With `keep_level` a mutation leaves the cost of a typical place
     about as it is, see `es.keep_level`. With a `return_floor` a candidate of a lower
-    return ranks behind all others, however safe it is, see `es.rank`.
+    return ranks behind all others, however safe it is, see `es.rank`. A candidate is
+    judged by the mean over its algorithms, or with `judge_by="worst"` by their highest
+    cost and lowest return: under a mean one algorithm may flee while the other drives.
     """
 
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -196,6 +199,7 @@ class SearchConfig:
     start: Start = "normal"
     keep_level: bool = False
     return_floor: float | None = None
+    judge_by: Judge = "mean"
 
     def __post_init__(self) -> None:
         require_counts(
@@ -232,7 +236,8 @@ class SearchConfig:
         tolerance = self.zero_tolerance
         ok = is_finite(tolerance) and tolerance >= 0
         require(ok, "zero_tolerance", "finite and >= 0", tolerance)
-        for name, kind in (("selection", Selection), ("start", Start)):
+        literals = {"selection": Selection, "start": Start, "judge_by": Judge}
+        for name, kind in literals.items():
             value, known = getattr(self, name), get_args(kind)
             require(value in known, name, f"one of {', '.join(known)}", value)
         flag = self.keep_level

@@ -192,9 +192,12 @@ def stage_result(
         for name, value in history.items()
     }
     broken = jnp.any(frozen, axis=0)
+    is_mean = config.judge_by == "mean"
+    cost = (jnp.mean if is_mean else jnp.max)(last["ep_cost"], axis=0)
+    ep_return = (jnp.mean if is_mean else jnp.min)(last["ep_return"], axis=0)
     fitness = Fitness(
-        cost=jnp.where(broken, jnp.inf, jnp.mean(last["ep_cost"], axis=0)),
-        ep_return=jnp.where(broken, -jnp.inf, jnp.mean(last["ep_return"], axis=0)),
+        cost=jnp.where(broken, jnp.inf, cost),
+        ep_return=jnp.where(broken, -jnp.inf, ep_return),
     )
     return StageResult(
         candidates=candidates,

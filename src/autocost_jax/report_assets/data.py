@@ -18,8 +18,8 @@ class StageRecord:
 
     Attributes:
       theta: [P, 41] the candidates' networks.
-      cost: [P] extrinsic cost of an episode, mean over algorithms; +inf: frozen.
-      ep_return: [P] return of an episode, mean over algorithms; -inf: frozen.
+      cost: [P] extrinsic cost of an episode, by `judge_by`; +inf: frozen.
+      ep_return: [P] return of an episode, likewise; -inf: frozen.
       algorithm_cost: [A, P] the same cost of each algorithm's agent.
       algorithm_return: [A, P] the same return of each algorithm's agent.
       zero_violation: [P] bool, whether no fitness episode had any extrinsic cost.

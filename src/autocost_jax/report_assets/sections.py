@@ -72,7 +72,8 @@ def evolution_section(data: ReportData) -> str:
             "Extrinsic cost of every candidate by stage. Stage means: "
             f"{_series(stage.mean_cost for stage in stages)}.",
             "Every dot is a candidate: its extrinsic cost after training, mean over "
-            f"the algorithms. The red line is zero violation.{lost}",
+            "the algorithms (the highest, in a search that judges by the worst). The "
+            f"red line is zero violation.{lost}",
         ),
         "return": (
             "Return of every candidate by stage. Stage means: "
