@@ -28,12 +28,20 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import paper
+import searches_tables
 from common import run_if_needed
 
-from autocost_jax import SearchConfig, load_cost, save_cost
+from autocost_jax import (
+    SearchConfig,
+    intrinsic_cost,
+    load_cost,
+    make_env,
+    save_cost,
+)
 from autocost_jax.arrays import load_arrays
 from autocost_jax.es import Fitness, rank
 from autocost_jax.methods import Method, TableConfig
@@ -41,6 +49,7 @@ from autocost_jax.rundata import to_json
 from autocost_jax.store import list_stages, read_config, run_facts
 
 SHIPPED = Path("src/autocost_jax/found")
+DISTANCES = (0.0, 0.3, 0.45, 0.6, 0.75, 0.9, 4.0)  # metres
 LOUDNESS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # a step, within 1.5 R of a hazard
 
 
@@ -309,10 +318,12 @@ def collect(args: argparse.Namespace) -> None:
     plan, searches = PLANS[args.scale], []
     for rule, seed, path in finished(args.runs, plan):
         stages = [load_arrays(file) for file in list_stages(path).values()]
+        facts = read_config(path)[1]
         searches.append(
             {
                 "rule": rule,
                 "seed": seed,
+                **{name: facts[name] for name in ("commit", "created", "device")},
                 **{name: [r.tolist() for r in rows] for name, rows in both(stages)},
                 "best": json.loads((path / "cost.json").read_text()),
             }
@@ -330,6 +341,7 @@ def collect(args: argparse.Namespace) -> None:
         "size": plan.size_text,
         "floor": plan.floor,
         "loudness": by_loudness(args.runs, plan),
+        "distance": by_distance(winner(args)),
     }
     for index, part in enumerate(plan.rounds):
         if (args.runs / part.name / "evaluation.json").exists():
@@ -339,8 +351,8 @@ def collect(args: argparse.Namespace) -> None:
             ]
     result = json.loads(json.dumps(to_json(result), allow_nan=False))
     file = paper.write(result, "evolution", args.results)
-    file.with_suffix(".md").write_text(render(result))
-    draw(result, file.with_suffix(".png"))
+    file.with_suffix(".md").write_text(searches_tables.render(result))
+    searches_tables.draw(result, file.with_suffix(".png"))
     draw_heat_map(args)
     print(file)
 
@@ -381,117 +393,38 @@ def by_loudness(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     return rows
 
 
-def render(result: dict[str, Any]) -> str:
-    """The searches, fitness by loudness, then the rounds of fresh seeds."""
-
-    def means(table: list[list[float]], digits: int) -> str:
-        return ", ".join(f"{np.mean(row):.{digits}f}" for row in table)
-
-    lines = [
-        "| rule, seed | mean cost of each stage | best cost of each stage "
-        "| mean return of each stage | at zero, of each stage "
-        f"| both agents return {result['floor']:g} | lowest worse cost of these |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for search in result["searches"]:
-        best = ", ".join(f"{min(stage):.2f}" for stage in search["cost"])
-        zero = ", ".join(str(sum(c <= 0 for c in stage)) for stage in search["cost"])
-        worse = zip(search["worst_cost"], search["worst_return"], strict=True)
-        useful = [
-            [c for c, gain in zip(*stage, strict=True) if gain >= result["floor"]]
-            for stage in worse
-        ]
-        lines.append(
-            f"| {search['rule']}, {search['seed']} "
-            f"| {means(search['cost'], 2)} | {best} "
-            f"| {means(search['return'], 1)} | {zero} "
-            f"| {', '.join(str(len(costs)) for costs in useful)} "
-            f"| {', '.join(f'{min(c):.2f}' if c else '-' for c in useful)} |"
-        )
-    lines += [
-        "",
-        "| cost of a step near a hazard | trained | mean cost | mean return |",
-        "|---|---|---|---|",
-    ]
-    for row in result["loudness"]:
-        lines.append(
-            f"| {row['low']} to {row['high']} | {row['count']} | {row['cost']:.1f} "
-            f"| {row['return']:.1f} |"
-        )
-    for name in ("shortlist", "validation"):
-        if name in result:
-            lines += ["", *render_round(name, result[name])]
-    return "\n".join(lines) + "\n"
+def winner(args: argparse.Namespace) -> Path:
+    """The file of the shipped cost, without its suffix."""
+    return args.results / "costs" / PLANS[args.scale].winner
 
 
-def render_round(name: str, rows: list[dict[str, Any]]) -> list[str]:
-    """The entrants of a round, best first."""
-    columns = ("return (95 %)", "cost (95 %)", "violating (at most)")
-    heads = [f"{paper.NAMES[a]}: {c}" for a in paper.BOTH for c in columns]
-    lines = [
-        f"| {name} | search: cost, return | {' | '.join(heads)} |",
-        "|---" * (2 + len(heads)) + "|",
-    ]
-    for row in rows:
-        cells = [
-            f"{row['rule']} {row['seed']}, stage {row['stage'] + 1}, {row['index']}",
-            f"{row['cost']:.2f}, {row['ep_return']:.1f}",
-        ]
-        for score in row[name].values():
-            gain, cost = score["return"], score["cost"]
-            cells += [
-                f"{gain['mean']:.1f} ({gain['low']:.1f} to {gain['high']:.1f})",
-                f"{cost['mean']:.2f} ({cost['low']:.2f} to {cost['high']:.2f})",
-                f"{score['violation_rate']:.1%} ({score['violation_rate_upper']:.1%})",
-            ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
-
-
-def draw(result: dict[str, Any], file: Path) -> None:
-    """The paper's scatter: a dot a candidate, best and mean of each stage; by rule."""
-    from matplotlib.figure import Figure
-
-    rules = list(dict.fromkeys(search["rule"] for search in result["searches"]))
-    if not rules:
-        return
-    size = (1 + 3.8 * len(rules), 5.5)
-    picture = Figure(figsize=size, layout="constrained")
-    axes = picture.subplots(2, len(rules), sharey="row", sharex=True, squeeze=False)
-    for column, rule in enumerate(rules):
-        own = [search for search in result["searches"] if search["rule"] == rule]
-        for search in own:
-            color = f"C{search['seed']}"
-            for row, key, best in ((0, "cost", min), (1, "return", max)):
-                panel, table = axes[row, column], search[key]
-                stages = np.arange(1, 1 + len(table))
-                for stage, values in zip(stages, table, strict=True):
-                    x = np.full(len(values), stage + 0.1 * (search["seed"] - 1))
-                    panel.plot(x, values, "o", color=color, mfc="white", ms=3)
-                label = f"seed {search['seed']}, mean"
-                means = [np.mean(v) for v in table]
-                panel.plot(stages, means, color=color, label=label)
-                panel.plot(stages, [best(v) for v in table], ":", color=color)
-        axes[0, column].set_title(f"{rule} rule (dotted: best)", fontsize=9)
-        axes[0, column].set_yscale("symlog", linthresh=0.1)
-        axes[0, column].axhline(0, color="r", linewidth=0.8)
-        axes[1, column].set_xlabel("stage")
-        axes[1, column].set_xticks(range(1, 1 + max(len(s["cost"]) for s in own)))
-    axes[0, 0].set_ylabel("extrinsic cost an episode")
-    axes[1, 0].set_ylabel("return an episode")
-    axes[0, 0].legend(fontsize=6)
-    title = f"Evolution, {result['scale']} scale: {result['size']}"
-    picture.suptitle(title, fontsize=9)
-    picture.savefig(file, dpi=130)
+def by_distance(file: Path, num_places: int = 8192) -> list[dict[str, Any]]:
+    """A cost at random places of its world, by the distance to the closest hazard."""
+    if not file.with_suffix(".npz").exists():
+        return []
+    env = make_env(paper.TRAINING_WORLD)
+    keys = jax.random.split(jax.random.key(0), num_places)
+    layout = jax.jit(jax.vmap(env.reset))(keys).layout
+    xy = jax.random.uniform(jax.random.key(1), (num_places, 2), minval=-2.0, maxval=2.0)
+    yaw = jax.random.uniform(jax.random.key(2), (num_places,), maxval=2 * np.pi)
+    layout = layout.replace(robot_xy=xy, robot_yaw=yaw)
+    inputs = jax.jit(jax.vmap(env.reset_to))(layout, keys).cost_inputs
+    cost = np.asarray(intrinsic_cost(load_cost(file), inputs.constraint_lidar))
+    distance = np.asarray(inputs.distance)
+    rows = []
+    for low, high in itertools.pairwise(DISTANCES):
+        own = cost[(distance >= low) & (distance < high)]
+        row = {"low": low, "high": high, "mean": own.mean()}
+        rows.append(row | {f"p{p}": np.percentile(own, p) for p in (10, 90)})
+    return rows
 
 
 def draw_heat_map(args: argparse.Namespace) -> None:
     """The shipped cost around one hazard, as in the paper."""
     from autocost_jax.report_assets.figures import heat_map
 
-    winner = args.results / "costs" / PLANS[args.scale].winner
-    if winner.with_suffix(".npz").exists():
-        picture = heat_map(np.asarray(load_cost(winner)), radius=0.3)
+    if winner(args).with_suffix(".npz").exists():
+        picture = heat_map(np.asarray(load_cost(winner(args))), radius=0.3)
         picture.savefig(args.results / "heat_map.png", dpi=130)
 
 

@@ -31,6 +31,7 @@ common = load_script("experiments/common")
 computing_time = load_script("experiments/computing_time")
 paper = load_script("experiments/paper")
 searches = load_script("experiments/searches")
+searches_tables = load_script("experiments/searches_tables")
 transfer = load_script("experiments/transfer")
 PLAN = searches.PLANS["smoke"]
 
@@ -102,7 +103,7 @@ def test_the_tables_of_the_readme_are_those_of_the_results():
     for name, shown in blocks:
         file = ROOT / "experiments" / "results" / f"{name}.json"
         result = json.loads(file.read_text())
-        render = {"evolution": searches.render, "transfer": transfer.render}
+        render = {"evolution": searches_tables.render, "transfer": transfer.render}
         expect = render.get(file.stem, paper.render)(result)
         assert shown.strip() == expect.strip(), name
 
