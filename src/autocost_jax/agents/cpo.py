@@ -40,6 +40,7 @@ from autocost_jax.agents.trust_region import (
     linearise,
 )
 from autocost_jax.config import AgentConfig
+from autocost_jax.precision import full_precision
 from autocost_jax.records import Key, Metrics, Slot, Trajectory
 
 _TINY = 1e-12  # norms below it count as zero; floor of what divides
@@ -230,6 +231,7 @@ def cpo(config: AgentConfig, env: EnvSizes) -> Agent:
             multiplier_opt=(),
         )
 
+    @full_precision
     def update(
         state: AgentState,
         trajectory: Trajectory,
@@ -237,27 +239,26 @@ def cpo(config: AgentConfig, env: EnvSizes) -> Agent:
         slot: Slot,
         key: Key,
     ) -> tuple[AgentState, Metrics]:
-        with jax.default_matmul_precision("highest"):
-            batch, metrics = prepare_batch(
-                config, networks, env.episode_length, state, trajectory, total_cost
-            )
-            theta, unravel = ravel_pytree(state.policy)
-            # J_c - d, never -(d - J_c): a cost of -0.0 would count as feasible.
-            c = (metrics["j_c"] - slot.cost.limit) / (env.episode_length + 1e-8)
+        batch, metrics = prepare_batch(
+            config, networks, env.episode_length, state, trajectory, total_cost
+        )
+        theta, unravel = ravel_pytree(state.policy)
+        # J_c - d, never -(d - J_c): a cost of -0.0 would count as feasible.
+        c = (metrics["j_c"] - slot.cost.limit) / (env.episode_length + 1e-8)
 
-            def distribution(theta: jax.Array) -> Any:
-                return networks.distribution(unravel(theta), batch.obs)
+        def distribution(theta: jax.Array) -> Any:
+            return networks.distribution(unravel(theta), batch.obs)
 
-            product = mlp_fisher_product(
-                state.policy, batch.obs, batch.weight, config.cg_damping
-            )
-            theta, policy_metrics = update_policy(
-                config, distribution, theta, batch, c, product
-            )
-            policy = unravel(theta)
-            critic, critic_opt, critic_norm = update_critics(
-                config, networks, state.critic, state.critic_opt, batch, key
-            )
+        product = mlp_fisher_product(
+            state.policy, batch.obs, batch.weight, config.cg_damping
+        )
+        theta, policy_metrics = update_policy(
+            config, distribution, theta, batch, c, product
+        )
+        policy = unravel(theta)
+        critic, critic_opt, critic_norm = update_critics(
+            config, networks, state.critic, state.critic_opt, batch, key
+        )
         new_state = state.replace(policy=policy, critic=critic, critic_opt=critic_opt)
         metrics = {
             **metrics,

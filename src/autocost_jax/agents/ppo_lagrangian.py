@@ -36,6 +36,7 @@ from autocost_jax.agents.networks import (
     make_networks,
 )
 from autocost_jax.config import AgentConfig
+from autocost_jax.precision import full_precision
 from autocost_jax.records import Key, Metrics, Slot, Trajectory
 
 
@@ -249,6 +250,7 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
             multiplier_opt=optax.adam(config.multiplier_lr).init(p),
         )
 
+    @full_precision
     def update(
         state: AgentState,
         trajectory: Trajectory,
@@ -257,30 +259,29 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
         key: Key,
     ) -> tuple[AgentState, Metrics]:
         key_policy, key_critic = jax.random.split(key)
-        with jax.default_matmul_precision("highest"):
-            batch, metrics = prepare_batch(
-                config, networks, env.episode_length, state, trajectory, total_cost
-            )
-            p, multiplier_opt = update_multiplier(
-                config,
-                state.multiplier,
-                state.multiplier_opt,
-                metrics["j_c"],
-                slot.cost.limit,
-            )
-            multiplier = slot.constrained * jax.lax.stop_gradient(jax.nn.softplus(p))
-            policy, policy_opt, policy_metrics = update_policy(
-                config,
-                networks,
-                state.policy,
-                state.policy_opt,
-                batch,
-                multiplier,
-                key_policy,
-            )
-            critic, critic_opt, critic_norm = update_critics(
-                config, networks, state.critic, state.critic_opt, batch, key_critic
-            )
+        batch, metrics = prepare_batch(
+            config, networks, env.episode_length, state, trajectory, total_cost
+        )
+        p, multiplier_opt = update_multiplier(
+            config,
+            state.multiplier,
+            state.multiplier_opt,
+            metrics["j_c"],
+            slot.cost.limit,
+        )
+        multiplier = slot.constrained * jax.lax.stop_gradient(jax.nn.softplus(p))
+        policy, policy_opt, policy_metrics = update_policy(
+            config,
+            networks,
+            state.policy,
+            state.policy_opt,
+            batch,
+            multiplier,
+            key_policy,
+        )
+        critic, critic_opt, critic_norm = update_critics(
+            config, networks, state.critic, state.critic_opt, batch, key_critic
+        )
         new_state = AgentState(
             policy=policy,
             critic=critic,
