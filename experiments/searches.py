@@ -48,6 +48,11 @@ from autocost_jax.methods import Method, TableConfig
 from autocost_jax.rundata import to_json
 from autocost_jax.store import list_stages, read_config, run_facts
 
+# What stands for the costs and for the returns of both algorithms.
+JUDGES: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
+    "mean": (np.mean, np.mean),
+    "worst": (np.max, np.min),
+}
 SHIPPED = Path("src/autocost_jax/found")
 DISTANCES = (0.0, 0.3, 0.45, 0.6, 0.75, 0.9, 4.0)  # metres
 LOUDNESS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # a step, within 1.5 R of a hazard
@@ -76,8 +81,7 @@ class Plan(NamedTuple):
 
     Attributes:
       size: flags that all of them share.
-      judge: what stands for both algorithms where the best of all searches are ranked:
-        "mean", or "worst" for the higher cost and the lower return.
+      judge: of `JUDGES`, where the best of all searches are ranked.
       floor: return that a cost must reach there.
       rules: flags and seeds of each rule.
       entered: the rules whose costs take part in the rounds.
@@ -168,6 +172,11 @@ def finished(runs: Path, plan: Plan) -> list[tuple[str, int, Path]]:
     return [row for row in paths if (row[2] / "cost.json").exists()]
 
 
+def entered(runs: Path, plan: Plan) -> list[tuple[str, int, Path]]:
+    """Those of them whose costs take part in the rounds."""
+    return [row for row in finished(runs, plan) if row[0] in plan.entered]
+
+
 def candidates(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     """What all searches have found, best first, ranked as one population.
 
@@ -175,22 +184,17 @@ def candidates(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     trained again counts once, with the mean of its scores, so that one lucky stage
     does not carry it.
     """
-    worst = plan.judge == "worst"
+    of_costs, of_returns = JUDGES[plan.judge]
     found: dict[bytes, list[dict[str, Any]]] = {}
-    for rule, seed, path in finished(runs, plan):
-        if rule not in plan.entered:
-            continue
+    for rule, seed, path in entered(runs, plan):
         for stage, file in list_stages(path).items():
             arrays = load_arrays(file)
+            costs = of_costs(arrays["scores/ep_cost"], 0)
+            returns = of_returns(arrays["scores/ep_return"], 0)
             for index, theta in enumerate(arrays["theta"]):
                 row = {"rule": rule, "seed": seed, "stage": stage, "index": index}
-                cost, ep_return = (
-                    arrays[f"scores/{name}"][:, index]
-                    for name in ("ep_cost", "ep_return")
-                )
-                row["theta"] = theta
-                row["cost"] = float(cost.max() if worst else cost.mean())
-                row["ep_return"] = float(ep_return.min() if worst else ep_return.mean())
+                row |= {"theta": theta, "cost": float(costs[index])}
+                row["ep_return"] = float(returns[index])
                 found.setdefault(theta.tobytes(), []).append(row)
     rows = [
         group[0]
@@ -259,13 +263,13 @@ def scored(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
         }
         result.append(row | {name: scores})
 
-    def judged(key: str, worst: Callable[..., float]) -> list[float]:
-        judge = worst if plan.judge == "worst" else np.mean
+    def judged(key: str, judge: Callable[..., Any]) -> list[float]:
         scores = [row[name].values() for row in result]
         return [float(judge([s[key]["mean"] for s in row])) for row in scores]
 
-    order = guided_order(judged("cost", max), judged("return", min), plan.floor)
-    return [result[i] for i in order]
+    of_costs, of_returns = JUDGES[plan.judge]
+    costs, returns = judged("cost", of_costs), judged("return", of_returns)
+    return [result[i] for i in guided_order(costs, returns, plan.floor)]
 
 
 def ship(args: argparse.Namespace) -> None:
@@ -359,12 +363,12 @@ def collect(args: argparse.Namespace) -> None:
 
 def both(stages: Sequence[dict[str, Any]]) -> Iterator[tuple[str, list[np.ndarray]]]:
     """Cost and return of each stage's candidates, by mean and by the worse agent."""
-    for name, source, worst in (
-        ("cost", "scores/ep_cost", np.max),
-        ("return", "scores/ep_return", np.min),
-    ):
-        yield name, [np.mean(stage[source], 0).round(4) for stage in stages]
-        yield f"worst_{name}", [worst(stage[source], 0).round(4) for stage in stages]
+    for prefix, judge in (("", "mean"), ("worst_", "worst")):
+        of_costs, of_returns = JUDGES[judge]
+        costs = [of_costs(stage["scores/ep_cost"], 0) for stage in stages]
+        returns = [of_returns(stage["scores/ep_return"], 0) for stage in stages]
+        yield f"{prefix}cost", [row.round(4) for row in costs]
+        yield f"{prefix}return", [row.round(4) for row in returns]
 
 
 def by_loudness(runs: Path, plan: Plan) -> list[dict[str, Any]]:
@@ -374,8 +378,7 @@ def by_loudness(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     """
     tables = [
         load_arrays(file)
-        for rule, _, path in finished(runs, plan)
-        if rule in plan.entered
+        for _, _, path in entered(runs, plan)
         for file in list_stages(path).values()
     ]
     if not tables:

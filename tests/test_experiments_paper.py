@@ -292,6 +292,23 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     assert (tmp_path / "evolution.png").exists()
 
 
+def test_the_worse_of_two_agents_can_decide(tmp_path):
+    """The best by the mean has an agent that flees, another a costly one."""
+    runs = tmp_path / "runs"
+    costs = [[0.0, 1.0, 0.5, 9.0], [3.0, 4.0, 5.0, 6.0]]
+    write_search(runs, costs, [[5.0, 5.0, 5.0, 9.0], [7.0, 6.0, 5.0, 4.0]])
+    scores = [[(9.0, 0.9, 60), (-3.0, 0.0, 0)], [(4.0, 0.5, 9), (3.0, 0.6, 9)]]
+    scores += [[(9.0, 1.0, 60), (9.0, 0.0, 60)]] + [[(9.0, 5.0, 60)] * 2] * 4
+    write_round(runs, 0, scores)
+    first = searches.entrants(runs, PLAN, 0)
+    for judge, expect in (("mean", [0, 2, 1]), ("worst", [1, 2, 3])):
+        plan = PLAN._replace(judge=judge)
+        ranked = searches.scored(runs, plan, 0)[:3]
+        assert [row["theta"].tolist() for row in ranked] == [
+            first[i]["theta"].tolist() for i in expect
+        ]
+
+
 def test_a_design_is_found_in_whatever_table_it_was_trained(tmp_path):
     """By what was trained: not by its label, nor with another cost or size."""
     scale, world = paper.scales()["smoke"], "Goal-Hazard-Point"
