@@ -27,7 +27,7 @@ import optax
 from autocost_jax import intrinsic_cost, load_cost, make_env, preset
 from autocost_jax.arrays import load_arrays
 from autocost_jax.commandline import use_devices
-from autocost_jax.config import THETA_SIZE
+from autocost_jax.config import THETA_SIZES
 from autocost_jax.methods import Method, TableConfig, run_table
 from autocost_jax.rundata import to_json
 from autocost_jax.store import list_stages, read_config, read_metrics, run_facts
@@ -158,7 +158,7 @@ def fit_steep(num_layouts: int = 2048, steps: int = 4000) -> jax.Array:
         change, moments = optimiser.update(gradient, moments)
         return (theta + change, moments), value
 
-    start = jax.random.normal(jax.random.key(10), (16, THETA_SIZE))
+    start = jax.random.normal(jax.random.key(10), (16, THETA_SIZES["dense"]))
 
     def fit(theta: jax.Array):
         state = (theta, optimiser.init(theta))

@@ -10,9 +10,10 @@ from N(0, 5^2) and selects and mutates as the paper does. "guided" starts from c
 that rise as anything comes nearer (`es.monotone_start`, std 8), ranks candidates whose
 return is below a floor behind all others (`es.rank`), and lets no mutation change how
 loud a cost is at a typical place (`es.keep_level`). "raw" is guided with the paper's
-mutations; "worst" is guided and judges a candidate by the worse of its two agents, not
-by their mean. Sizes, seeds and rounds are in `PLANS`; `--scale reduced_10m` wants a
-GPU, `--smoke` is for tests.
+mutations. "shared" searches among networks that treat all bins of the lidar alike,
+starts from costs of a set loudness (`es.graded_start`), and judges a candidate by the
+worse of its two agents, not by their mean; else it is guided. Sizes, seeds and rounds
+are in `PLANS`; `--scale reduced_10m` wants a GPU, `--smoke` is for tests.
 
 What looks best in a search is partly lucky, so the best of all searches go through
 rounds of agents with fresh seeds: many of them briefly, the best of these for longer.
@@ -100,10 +101,16 @@ class Plan(NamedTuple):
     size_text: str
 
 
-def guided(floor: float, *more: str) -> tuple[str, ...]:
+def guided(floor: float, *more: str, start: str = "monotone") -> tuple[str, ...]:
     """Flags of a search that wants costs to be useful."""
-    start = ("--start", "monotone", "--init-std", "8")
-    return (*start, "--return-floor", str(floor), *more)
+    first = ("--start", start, "--init-std", "8")
+    return (*first, "--return-floor", str(floor), *more)
+
+
+def shared(floor: float) -> tuple[str, ...]:
+    """Flags of a search among networks that treat all bins of the lidar alike."""
+    more = ("--keep-level", "--judge-by", "worst", "--network", "shared")
+    return guided(floor, *more, start="graded")
 
 
 FRESH = (100, 101, 102, 103, 104)
@@ -121,7 +128,7 @@ PLANS = {
             "guided": (guided(2.0, "--keep-level"), (0, 1, 2)),
             "paper": ((), (0, 1, 2)),
             "raw": (guided(2.0), (0,)),
-            "worst": (guided(2.0, "--keep-level", "--judge-by", "worst"), (0, 1, 2)),
+            "shared": (shared(2.0), (0, 1, 2)),
         },
         ("guided", "paper", "raw"),
         (

@@ -21,10 +21,11 @@ from autocost_jax.env_config import EnvConfig
 
 Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
-Start = Literal["normal", "monotone"]
+Start = Literal["normal", "monotone", "graded"]
 Judge = Literal["mean", "worst"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
-THETA_SIZE = 41
+CostNetwork = Literal["dense", "shared"]
+THETA_SIZES: dict[CostNetwork, int] = {"dense": 41, "shared": 13}
 
 
 @dataclass(frozen=True)
@@ -173,13 +174,16 @@ class SearchConfig:
     a mean extrinsic cost <= `zero_tolerance` over those episodes.
     `selection="random"` replaces the ranking by a random choice: the control.
 
-    Four options of ours beside the paper's rule. `start="monotone"` draws first costs
+    Five options of ours beside the paper's rule. `start="monotone"` draws first costs
     that rise as anything comes nearer and are small at a typical place, see
-    `es.monotone_start`. With `keep_level` a mutation leaves the cost of a typical place
+    `es.monotone_start`; "graded" ones also have a set loudness, see
+    `es.graded_start`. With `keep_level` a mutation leaves the cost of a typical place
     about as it is, see `es.keep_level`. With a `return_floor` a candidate of a lower
     return ranks behind all others, however safe it is, see `es.rank`. A candidate is
     judged by the mean over its algorithms, or with `judge_by="worst"` by their highest
     cost and lowest return: under a mean one algorithm may flee while the other drives.
+    With `network="shared"` candidates are networks of 13 parameters that treat all bins
+    of the lidar alike, see `costs.intrinsic_logit`; "dense" is the paper's, of 41.
     """
 
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -200,6 +204,7 @@ class SearchConfig:
     keep_level: bool = False
     return_floor: float | None = None
     judge_by: Judge = "mean"
+    network: CostNetwork = "dense"
 
     def __post_init__(self) -> None:
         require_counts(
@@ -236,7 +241,12 @@ class SearchConfig:
         tolerance = self.zero_tolerance
         ok = is_finite(tolerance) and tolerance >= 0
         require(ok, "zero_tolerance", "finite and >= 0", tolerance)
-        literals = {"selection": Selection, "start": Start, "judge_by": Judge}
+        literals = {
+            "selection": Selection,
+            "start": Start,
+            "judge_by": Judge,
+            "network": CostNetwork,
+        }
         for name, kind in literals.items():
             value, known = getattr(self, name), get_args(kind)
             require(value in known, name, f"one of {', '.join(known)}", value)
@@ -246,6 +256,11 @@ class SearchConfig:
         require(floor is None or is_finite(floor), "return_floor", "finite", floor)
         ok = is_integer(self.seed) and 0 <= self.seed < 2**32
         require(ok, "seed", "an integer in [0, 2**32)", self.seed)
+
+    @property
+    def theta_size(self) -> int:
+        """Parameters of a candidate, D."""
+        return THETA_SIZES[self.network]
 
     @property
     def final_rounds(self) -> int:

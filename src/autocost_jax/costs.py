@@ -19,11 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.arrays import load_arrays
-from autocost_jax.config import THETA_SIZE
+from autocost_jax.config import THETA_SIZES
 from autocost_jax.env_config import LIDAR_BINS
 from autocost_jax.records import CostInputs, TrainingCost
 
 HIDDEN = 4  # the paper's hidden layer: 8 * 4 + 4 + 4 + 1 = 41 parameters
+_SIZES = " or ".join(str(size) for size in THETA_SIZES.values())
 
 
 class CostTerm(NamedTuple):
@@ -42,7 +43,8 @@ def intrinsic_cost(theta: jax.Array, lidar: jax.Array) -> jax.Array:
     """The evolved cost: sigmoid(W2 sigmoid(W1 lidar + b1) + b2), in (0, 1).
 
     Args:
-      theta: [41] parameters: W1 [8, 4] row-major, b1 [4], W2 [4], b2.
+      theta: [41] parameters: W1 [8, 4] row-major, b1 [4], W2 [4], b2; or [13]: a W1
+        [1, 4] that all bins share, see `intrinsic_logit`.
       lidar: [..., 8] the constraint lidar of the post-step state.
 
     Returns:
@@ -55,13 +57,24 @@ def intrinsic_cost(theta: jax.Array, lidar: jax.Array) -> jax.Array:
 
 
 def intrinsic_logit(theta: jax.Array, lidar: jax.Array) -> jax.Array:
-    """What the output sigmoid of `intrinsic_cost` is taken of, [...]."""
-    split = LIDAR_BINS * HIDDEN
-    w1 = theta[:split].reshape(LIDAR_BINS, HIDDEN)
+    """What the output sigmoid of `intrinsic_cost` is taken of, [...].
+
+    With a theta of 41 the paper's network. With one of 13 (ours) each bin i goes
+    through the same hidden layer, W2 sum_i sigmoid(W1 lidar_i + b1) + b2: turning the
+    robot by one bin changes nothing, so that a cost cannot be silent on one side, and
+    it takes one steep unit to tell whether anything is nearer than some distance.
+    """
+    split = theta.shape[-1] - 2 * HIDDEN - 1
+    w1 = theta[:split].reshape(-1, HIDDEN)
     b1, w2, b2 = theta[split : split + HIDDEN], theta[split + HIDDEN : -1], theta[-1]
     # Bins first: eight multiply-adds fuse where a [.., 8] x [8, 4] matmul would not.
-    pre = b1 + sum(lidar[..., i, None] * w1[i] for i in range(LIDAR_BINS))
-    return jnp.sum(jax.nn.sigmoid(pre) * w2, axis=-1) + b2
+    bins = [lidar[..., i, None] for i in range(LIDAR_BINS)]
+    if w1.shape[0] == 1:
+        hidden = sum(jax.nn.sigmoid(b1 + reading * w1[0]) for reading in bins)
+    else:
+        pre = b1 + sum(reading * w for reading, w in zip(bins, w1, strict=True))
+        hidden = jax.nn.sigmoid(pre)
+    return jnp.sum(hidden * w2, axis=-1) + b2
 
 
 def _extrinsic(inputs: CostInputs, theta: jax.Array) -> jax.Array:
@@ -183,9 +196,9 @@ def training_cost(
             raise ValueError(
                 f"method {method!r} needs the parameters of a cost (theta)"
             )
-        theta = np.zeros(THETA_SIZE, np.float32)
-    if np.shape(theta) != (THETA_SIZE,):
-        raise ValueError(f"theta must have shape [{THETA_SIZE}], got {np.shape(theta)}")
+        theta = np.zeros(THETA_SIZES["dense"], np.float32)
+    if not _is_theta(np.shape(theta)):
+        raise ValueError(f"theta must have {_SIZES} parameters, got {np.shape(theta)}")
     return TrainingCost(
         weights=jnp.asarray(weights),
         theta=jnp.asarray(theta, jnp.float32),
@@ -196,11 +209,11 @@ def training_cost(
 def save_cost(
     path: str | Path, theta: jax.Array | np.ndarray, card: Mapping[str, Any]
 ) -> None:
-    """Write `<path>.npz` (theta [41], float32) and `<path>.json` (its card).
+    """Write `<path>.npz` (theta [D], float32) and `<path>.json` (its card).
 
     Raises:
-      ValueError: if theta is not 41 finite numbers, the card not JSON, or the path a
-        name of `list_costs`, by which `load_cost` would not find it again.
+      ValueError: if theta is not 41 or 13 finite numbers, the card not JSON, or the
+        path a name of `list_costs`, by which `load_cost` would not find it again.
     """
     if str(path) in list_costs():
         raise ValueError(f"{path} is a cost of the package: write to ./{path} instead")
@@ -219,7 +232,7 @@ def list_costs() -> list[str]:
 
 
 def load_cost(path: str | Path) -> jax.Array:
-    """The parameters theta [41] of a saved cost, or of one the package brings along.
+    """The parameters theta [D] of a saved cost, or of one the package brings along.
 
     Args:
       path: a name of `list_costs`, which goes before a file of that name, or a file.
@@ -249,11 +262,15 @@ def cost_card(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"{file} is not a readable card: {error}") from None
 
 
+def _is_theta(shape: tuple[int, ...]) -> bool:
+    return len(shape) == 1 and shape[0] in THETA_SIZES.values()
+
+
 def _check_theta(file: Path, theta: np.ndarray) -> None:
-    is_theta = theta.shape == (THETA_SIZE,) and theta.dtype.kind in "fiu"
+    is_theta = _is_theta(theta.shape) and theta.dtype.kind in "fiu"
     if not is_theta or not np.isfinite(theta).all():
         raise ValueError(
-            f"{file}: theta must be {THETA_SIZE} finite numbers, "
+            f"{file}: theta must be {_SIZES} finite numbers, "
             f"got {theta.dtype}{list(theta.shape)}"
         )
 

@@ -16,11 +16,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from autocost_jax.config import THETA_SIZE, SearchConfig
+from autocost_jax.config import THETA_SIZES, CostNetwork, SearchConfig
 from autocost_jax.costs import HIDDEN, intrinsic_logit
 from autocost_jax.records import Key
 
-QUIET_COST = 1e-4  # of a `monotone_start` at a typical place
+QUIET_COST = 1e-4  # of a `monotone_start` or `graded_start` at a typical place
+LOUD_COSTS = (0.01, 0.5)  # of a `graded_start` at an exposed place
 
 
 class Fitness(struct.PyTreeNode):
@@ -178,7 +179,13 @@ def mutate(
     return treedef.unflatten(children)
 
 
-def monotone_start(key: Key, num: int, std: float, lidars: jax.Array) -> jax.Array:
+def monotone_start(
+    key: Key,
+    num: int,
+    std: float,
+    lidars: jax.Array,
+    network: CostNetwork = "dense",
+) -> jax.Array:
     """Random costs that never fall as anything comes nearer; not the paper's start.
 
     Weights are |N(0, std^2)|, hidden units turn on around the mean lidar (their biases
@@ -191,20 +198,87 @@ def monotone_start(key: Key, num: int, std: float, lidars: jax.Array) -> jax.Arr
       num: P.
       std: scale of the parameters.
       lidars: [M, 8] readings at typical places.
+      network: which network the parameters are of.
 
     Returns:
-      theta [P, 41].
+      theta [P, D].
     """
-    theta = std * jax.random.normal(key, (num, THETA_SIZE), lidars.dtype)
-    bins = lidars.shape[-1]
-    inner = jnp.abs(theta[:, : bins * HIDDEN])
-    middle = jnp.einsum("b,pbh->ph", lidars.mean(0), inner.reshape(num, bins, HIDDEN))
-    bias = theta[:, bins * HIDDEN : -HIDDEN - 1] - middle
-    outer = jnp.abs(theta[:, -HIDDEN - 1 : -1])
-    theta = jnp.concatenate([inner, bias, outer, jnp.zeros((num, 1))], axis=1)
-    logits = jax.vmap(lambda theta: intrinsic_logit(theta, lidars))(theta)
-    quiet = jnp.log(QUIET_COST / (1 - QUIET_COST)) - jnp.median(logits, axis=1)
+    inner, bias, outer = _random_parts(key, num, std, network)
+    rows = inner.shape[1]
+    typical = lidars.mean(0).reshape(rows, -1).mean(1)
+    bias = bias - jnp.einsum("b,pbh->ph", typical, inner)
+    theta = _join_parts(inner, bias, outer, jnp.zeros(num))
+    quiet = _logit(QUIET_COST) - jnp.median(_logits(theta, lidars), axis=1)
     return theta.at[:, -1].set(quiet)
+
+
+def graded_start(
+    key: Key,
+    num: int,
+    std: float,
+    lidars: jax.Array,
+    network: CostNetwork = "dense",
+) -> jax.Array:
+    """Random monotone costs of a set loudness; not the paper's start.
+
+    As `monotone_start`, but each hidden unit turns on where one of the typical places
+    has its readings (the shared network: its highest one), and the output layer is
+    scaled so that the cost is 1e-4 at the median place and log-uniform in [0.01, 0.5]
+    at the 90th percentile: most of a `monotone_start` is silent everywhere or so loud
+    that agents flee, whatever its shape.
+
+    Args:
+      key: consumed.
+      num: P.
+      std: scale of the parameters, before the output layer is scaled.
+      lidars: [M, 8] readings at typical places.
+      network: which network the parameters are of.
+
+    Returns:
+      theta [P, D].
+    """
+    key_parts, key_place, key_level = jax.random.split(key, 3)
+    inner, _, outer = _random_parts(key_parts, num, std, network)
+    index = jax.random.randint(key_place, (num, HIDDEN), 0, lidars.shape[0])
+    if network == "shared":
+        bias = -inner[:, 0] * lidars.max(1)[index]
+    else:
+        bias = -jnp.einsum("phb,pbh->ph", lidars[index], inner)
+    theta = _join_parts(inner, bias, outer, jnp.zeros(num))
+    low, high = jnp.percentile(_logits(theta, lidars), jnp.array([50, 90]), axis=1)
+    low_level, high_level = (jnp.log(cost) for cost in LOUD_COSTS)
+    level = jax.random.uniform(key_level, (num,), minval=low_level, maxval=high_level)
+    contrast = jnp.maximum(high - low, 0.01 * outer.sum(1))  # units may be all but off
+    scale = (_logit(jnp.exp(level)) - _logit(QUIET_COST)) / contrast
+    last = _logit(QUIET_COST) - scale * low
+    return _join_parts(inner, bias, scale[:, None] * outer, last)
+
+
+def _random_parts(
+    key: Key, num: int, std: float, network: CostNetwork
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """|W1| [P, rows, 4], b1 [P, 4] and |W2| [P, 4] of N(0, std^2)."""
+    theta = std * jax.random.normal(key, (num, THETA_SIZES[network]), jnp.float32)
+    split = theta.shape[1] - 1 - 2 * HIDDEN
+    inner, bias, outer = jnp.split(theta[:, :-1], (split, split + HIDDEN), axis=1)
+    return jnp.abs(inner).reshape(num, -1, HIDDEN), bias, jnp.abs(outer)
+
+
+def _join_parts(
+    inner: jax.Array, bias: jax.Array, outer: jax.Array, last: jax.Array
+) -> jax.Array:
+    """Theta [P, D] of its parts, the last one [P]."""
+    parts = (inner.reshape(len(inner), -1), bias, outer, last[:, None])
+    return jnp.concatenate(parts, axis=1)
+
+
+def _logits(theta: jax.Array, lidars: jax.Array) -> jax.Array:
+    """[P, M] of theta [P, D] and lidars [M, 8]."""
+    return jax.vmap(lambda theta: intrinsic_logit(theta, lidars))(theta)
+
+
+def _logit(cost: jax.Array | float) -> jax.Array:
+    return jnp.log(cost / (1 - jnp.asarray(cost)))
 
 
 def keep_level(
@@ -219,13 +293,13 @@ def keep_level(
 
     Args:
       key: consumed.
-      elites: theta [E, 41].
-      children: theta [C, 41], dealt round-robin as by `mutate`.
+      elites: theta [E, D].
+      children: theta [C, D], dealt round-robin as by `mutate`.
       lidars: [M, 8] readings at typical places.
       std: deviation of the logarithm.
 
     Returns:
-      theta [C, 41].
+      theta [C, D].
     """
 
     def level(theta: jax.Array) -> jax.Array:
@@ -239,7 +313,7 @@ def keep_level(
 
 
 def _normal_start(config: SearchConfig, key: Key) -> jax.Array:
-    shape = (config.population_size, THETA_SIZE)
+    shape = (config.population_size, config.theta_size)
     return config.init_std * jax.random.normal(key, shape, jnp.float32)
 
 
@@ -248,14 +322,14 @@ def truncation_es(
     start: Callable[[Key], jax.Array] | None = None,
     adjust: Callable[[Key, jax.Array, jax.Array], jax.Array] | None = None,
 ) -> ES:
-    """The paper's search over theta [41]: keep the best, mutate, repeat.
+    """The paper's search over theta [D]: keep the best, mutate, repeat.
 
     `config.selection` "random" replaces the ranking by a random choice of elites, the
     control that shows what selection adds.
 
     Args:
       config: the search.
-      start: key -> first candidates [P, 41]; default: N(0, `config.init_std`^2).
+      start: key -> first candidates [P, D]; default: N(0, `config.init_std`^2).
       adjust: (key, elites, children) -> the children to train, such as `keep_level`.
     """
     size, elites = config.population_size, config.num_elites
@@ -266,8 +340,8 @@ def truncation_es(
     def init() -> ESState:
         return ESState(
             generation=jnp.zeros((), jnp.int32),
-            elites=jnp.zeros((elites, THETA_SIZE), jnp.float32),
-            archive=jnp.zeros((capacity, THETA_SIZE), jnp.float32),
+            elites=jnp.zeros((elites, config.theta_size), jnp.float32),
+            archive=jnp.zeros((capacity, config.theta_size), jnp.float32),
             archive_fitness=Fitness(
                 cost=jnp.full(capacity, jnp.inf, jnp.float32),
                 ep_return=jnp.full(capacity, -jnp.inf, jnp.float32),

@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 
 from autocost_jax import es as es_lib
-from autocost_jax.config import SearchConfig
+from autocost_jax.config import SearchConfig, Start
 from autocost_jax.costs import BANK, CostTerm, training_cost
 from autocost_jax.envs.env import make_env
 from autocost_jax.es import ES, ESState, Fitness, truncation_es
@@ -37,6 +37,12 @@ TRACKED = (
     "intrinsic_far",
     "intrinsic_near",
 )
+# How the first candidates are drawn; None: the strategy's own N(0, init_std^2).
+STARTS: dict[Start, Callable[..., jax.Array] | None] = {
+    "normal": None,
+    "monotone": es_lib.monotone_start,
+    "graded": es_lib.graded_start,
+}
 # Purposes of a stage's keys: every key is fold_in(root, stage, purpose).
 ASK, TELL, SLOTS = range(3)
 
@@ -245,7 +251,8 @@ def stage_functions(
 
 def _strategy(config: SearchConfig) -> ES:
     """The strategy with the options that look at the world's typical places."""
-    if config.start == "normal" and not config.keep_level:
+    first = STARTS[config.start]
+    if first is None and not config.keep_level:
         return truncation_es(config)
     env = make_env(config.train.env)
 
@@ -254,7 +261,7 @@ def _strategy(config: SearchConfig) -> ES:
 
     def start(key: Key) -> jax.Array:
         size, std = config.population_size, config.init_std
-        return es_lib.monotone_start(key, size, std, lidars())
+        return first(key, size, std, lidars(), config.network)
 
     def adjust(key: Key, elites: jax.Array, children: jax.Array) -> jax.Array:
         std = config.mutation_std
@@ -262,7 +269,7 @@ def _strategy(config: SearchConfig) -> ES:
 
     return truncation_es(
         config,
-        start if config.start == "monotone" else None,
+        None if first is None else start,
         adjust if config.keep_level else None,
     )
 

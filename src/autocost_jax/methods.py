@@ -61,7 +61,7 @@ class Method:
       algorithm: ppo, ppo_lagrangian or cpo.
       cost: the training cost, see `costs.training_cost`.
       limit: allowed training cost of an episode.
-      theta: the intrinsic network's 41 parameters, if `cost` uses it.
+      theta: the intrinsic network's parameters, if `cost` uses it.
     """
 
     label: str
@@ -85,7 +85,7 @@ class TableConfig:
 
     Attributes:
       train: worlds, epochs and the learners' settings.
-      methods: the rows; labels are distinct.
+      methods: the rows; labels are distinct, networks of one size.
       seeds: one slot a method and seed.
     """
 
@@ -97,6 +97,12 @@ class TableConfig:
         labels = [method.label for method in self.methods]
         if not labels or len(set(labels)) < len(labels):
             raise ValueError(f"methods must have distinct labels, got {labels}")
+        sizes = {len(row.theta) for row in self.methods if row.theta is not None}
+        if len(sizes) > 1:
+            raise ValueError(
+                "the methods of a table must have cost networks of one size, "
+                f"got {sorted(sizes)} parameters"
+            )
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds must be distinct numbers, got {self.seeds}")
 
@@ -136,9 +142,11 @@ class TableState(struct.PyTreeNode):
 
 def table_slots(config: TableConfig) -> tuple[Slot, ...]:
     """The stacked slots of each group; the key of a slot is that of its seed."""
+    thetas = [row.theta for row in config.methods if row.theta is not None]
+    unused = np.zeros_like(thetas[0]) if thetas else None
 
     def slot(method: Method, seed: int) -> Slot:
-        theta = None if method.theta is None else np.asarray(method.theta)
+        theta = unused if method.theta is None else np.asarray(method.theta)
         return Slot(
             cost=training_cost(method.cost, theta, method.limit),
             key=jax.random.key(seed),

@@ -41,7 +41,7 @@ class Player:
       actions: "sampled", "mean" or "scripted".
       make_agent: environment -> agent and its state.
       page: where its replay goes by default.
-      theta: [41] the intrinsic cost that it was trained with, or None.
+      theta: [D] the intrinsic cost that it was trained with, or None.
     """
 
     world: str

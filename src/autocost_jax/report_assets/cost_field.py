@@ -8,7 +8,6 @@ Array = np.ndarray[Any, Any]
 
 LIDAR_BINS = 8
 HIDDEN = 4
-THETA_SIZE = LIDAR_BINS * HIDDEN + HIDDEN + HIDDEN + 1
 
 
 def object_lidar(ego_xy: Array) -> Array:
@@ -46,17 +45,23 @@ def network_cost(theta: Array, lidar: Array) -> Array:
 
         c = sigmoid(W2 . sigmoid(W1 l + b1) + b2)
 
+    With one row in W1 all bins share it, and their hidden layers are added up.
+
     Args:
-      theta: [41] W1 row-major 8 x 4, b1, W2, b2.
+      theta: [41] W1 row-major 8 x 4, b1, W2, b2; or [13] with a W1 of 1 x 4.
       lidar: [..., 8] readings in [0, 1].
 
     Returns:
       [...] cost in (0, 1).
     """
     theta = np.asarray(theta, float)
-    first, end = LIDAR_BINS * HIDDEN, LIDAR_BINS * HIDDEN + HIDDEN
-    hidden = lidar @ theta[:first].reshape(LIDAR_BINS, HIDDEN) + theta[first:end]
-    return _sigmoid(_sigmoid(hidden) @ theta[end:-1] + theta[-1])
+    end = len(theta) - HIDDEN - 1
+    w1, b1 = theta[: end - HIDDEN].reshape(-1, HIDDEN), theta[end - HIDDEN : end]
+    if len(w1) == LIDAR_BINS:
+        hidden = _sigmoid(lidar @ w1 + b1)
+    else:
+        hidden = _sigmoid(lidar[..., None] @ w1 + b1).sum(-2)
+    return _sigmoid(hidden @ theta[end:-1] + theta[-1])
 
 
 def _sigmoid(x: Array) -> Array:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from autocost_jax.report_assets.cost_field import THETA_SIZE, Array
+from autocost_jax.report_assets.cost_field import Array
 from autocost_jax.report_assets.replay import Replay
 
 TIMID_DISTANCE = 1.0  # metres an episode; an agent below it hardly moves
@@ -17,7 +17,7 @@ class StageRecord:
     """One finished stage of the search.
 
     Attributes:
-      theta: [P, 41] the candidates' networks.
+      theta: [P, D] the candidates' networks.
       cost: [P] extrinsic cost of an episode, by `judge_by`; +inf: frozen.
       ep_return: [P] return of an episode, likewise; -inf: frozen.
       algorithm_cost: [A, P] the same cost of each algorithm's agent.
@@ -93,7 +93,7 @@ class BestCandidate:
     Attributes:
       stage: index into `ReportData.stages`, from 0.
       index: its row in that stage.
-      theta: [41] its network.
+      theta: [D] its network.
       label: why it is the best.
       card: lines that describe the saved cost.
     """
@@ -186,7 +186,7 @@ def _check_stage(stage: StageRecord, algorithms: int, name: str) -> None:
     size = np.shape(stage.cost)[0] if np.ndim(stage.cost) == 1 else -1
     if size < 1:
         raise ValueError(f"{name}.cost must be [P], got shape {np.shape(stage.cost)}")
-    _shape(stage.theta, (size, THETA_SIZE), f"{name}.theta")
+    _shape(stage.theta, (size, *np.shape(stage.theta)[-1:]), f"{name}.theta")
     for key in ("ep_return", "zero_violation", "far_cost", "near_cost"):
         _shape(getattr(stage, key), (size,), f"{name}.{key}")
     for key in ("algorithm_cost", "algorithm_return", "distance_travelled"):
@@ -209,9 +209,9 @@ def _check_curve(curve: Curve, algorithms: tuple[str, ...], name: str) -> None:
 
 
 def _check_best(best: BestCandidate, stages: tuple[StageRecord, ...]) -> None:
-    _shape(best.theta, (THETA_SIZE,), "best.theta")
     if not 0 <= best.stage < len(stages):
         raise ValueError(f"best.stage must be in [0, {len(stages)}), got {best.stage}")
+    _shape(best.theta, np.shape(stages[best.stage].theta)[1:], "best.theta")
     zero = stages[best.stage].zero_violation
     if not 0 <= best.index < len(zero):
         raise ValueError(f"best.index must be in [0, {len(zero)}), got {best.index}")

@@ -40,7 +40,7 @@ def heat_map(theta: Array, radius: float, obstacle: str = "hazard") -> "Figure":
     """The evolved cost around one obstacle at the origin, and its radial profile.
 
     Args:
-      theta: [41] parameters of the network.
+      theta: [D] parameters of the network.
       radius: of the obstacle, metres.
       obstacle: what to call it.
     """

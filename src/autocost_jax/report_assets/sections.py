@@ -127,8 +127,8 @@ def best_section(data: ReportData) -> str:
     lines = "".join(f"<li>{escape(line)}</li>" for line in (*scores, *best.card))
     card = (
         f'<div class="card"><h3>Its card</h3><ul class="facts">{lines}</ul>'
-        "<details><summary>Its 41 parameters</summary><p>W1 (8 rows of 4), b1, W2, "
-        f"b2:</p><pre>{escape(theta)}</pre></details></div>"
+        f"<details><summary>Its {len(best.theta)} parameters</summary><p>W1 (rows of "
+        f"4), b1, W2, b2:</p><pre>{escape(theta)}</pre></details></div>"
     )
     figures = _figures("best", panels, notes, card)
     return section("best", "The best cost", escape(where), figures)
