@@ -125,3 +125,14 @@ def test_slots_of_a_table_follow_its_rows():
     np.testing.assert_array_equal(cpo.cost.limit, [-1.0, -1.0])
     with pytest.raises(ValueError, match="distinct labels"):
         TableConfig(methods=(Method("a"), Method("a")))
+
+
+def test_networks_of_a_table_have_one_size():
+    """Slots are stacked; one without a network takes the size of the others."""
+    cost = "extrinsic+intrinsic"
+    methods = [Method("plain")]
+    methods += [Method(f"{n}", cost=cost, theta=(0.5,) * n) for n in (13, 41)]
+    with pytest.raises(ValueError, match=r"one size, got \[13, 41\]"):
+        TableConfig(methods=tuple(methods))
+    (slots,) = table_slots(TableConfig(methods=tuple(methods[:2])))
+    np.testing.assert_array_equal(slots.cost.theta, [[0.0] * 13, [0.5] * 13])

@@ -142,6 +142,7 @@ BAD = {
         "keep_level": (1, "yes"),
         "return_floor": FINITE,
         "judge_by": ("best", ""),
+        "network": ("wide", ""),
     },
 }
 CASES = [

@@ -41,6 +41,14 @@ def reference(theta, lidar):
     return sigmoid(hidden @ theta[36:40] + theta[40])
 
 
+def shared_reference(theta, lidar):
+    """The network of 13 parameters in NumPy, bin by bin."""
+    hidden = np.zeros((*lidar.shape[:-1], 4))
+    for i in range(8):
+        hidden += sigmoid(theta[:4] * lidar[..., i : i + 1] + theta[4:8])
+    return sigmoid(hidden @ theta[8:12] + theta[12])
+
+
 @pytest.mark.parametrize(
     ("lidar", "expected"),
     [
@@ -72,6 +80,17 @@ def test_the_network_against_numpy(key):
     assert float(got.min()) > 0.0
     assert float(got.max()) < 1.0
     np.testing.assert_allclose(got, expected, atol=ROUNDING)
+
+
+def test_the_shared_network_treats_all_bins_alike(key):
+    key_theta, key_lidar = jax.random.split(key)
+    theta = 3.0 * jax.random.normal(key_theta, (13,))
+    lidar = jax.random.uniform(key_lidar, (5, 7, 8))
+    got = intrinsic_cost(theta, lidar)
+    expected = shared_reference(np.asarray(theta), np.asarray(lidar))
+    np.testing.assert_allclose(got, expected, atol=ROUNDING)
+    for turned in (jnp.roll(lidar, 3, -1), lidar[..., ::-1]):
+        np.testing.assert_allclose(intrinsic_cost(theta, turned), got, atol=ROUNDING)
 
 
 def make_inputs():
@@ -269,9 +288,12 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, name):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("theta", [np.zeros(40), np.full(41, np.nan)])
+@pytest.mark.parametrize(
+    "theta",
+    [np.zeros(40), np.zeros((1, 41)), np.full(41, np.nan), np.full(13, np.inf)],
+)
 def test_a_bad_cost_is_not_saved(tmp_path, theta):
-    with pytest.raises(ValueError, match="41 finite numbers"):
+    with pytest.raises(ValueError, match="41 or 13 finite numbers"):
         save_cost(tmp_path / "cost", theta, {})
     assert not os.listdir(tmp_path)
 

@@ -11,9 +11,11 @@ from autocost_jax import make_env, preset
 from autocost_jax.config import SearchConfig
 from autocost_jax.costs import intrinsic_cost, intrinsic_logit
 from autocost_jax.es import (
+    LOUD_COSTS,
     QUIET_COST,
     Fitness,
     best,
+    graded_start,
     keep_level,
     monotone_start,
     mutate,
@@ -144,10 +146,11 @@ def lidars_of(distance, count=64):
     return 0.1 * bins + nearest * jnp.exp(-distance)
 
 
-def test_a_monotone_start_never_falls_as_something_comes_nearer(key):
+@pytest.mark.parametrize(("network", "size"), [("dense", 41), ("shared", 13)])
+def test_a_monotone_start_never_falls_as_something_comes_nearer(key, network, size):
     places = lidars_of(1.0)
-    theta = monotone_start(key, 50, 5.0, places)
-    assert theta.shape == (50, 41)
+    theta = monotone_start(key, 50, 5.0, places, network)
+    assert theta.shape == (50, size)
     near = jax.vmap(lambda theta: intrinsic_cost(theta, lidars_of(0.2)))(theta)
     far = jax.vmap(lambda theta: intrinsic_cost(theta, lidars_of(0.9)))(theta)
     assert bool((near >= far).all())
@@ -155,6 +158,24 @@ def test_a_monotone_start_never_falls_as_something_comes_nearer(key):
     typical = jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta)
     middle = np.median(np.asarray(typical), axis=1)
     np.testing.assert_allclose(middle, QUIET_COST, rtol=0.05)
+
+
+@pytest.mark.parametrize("network", ["dense", "shared"])
+def test_a_graded_start_is_quiet_at_a_typical_place_and_loud_at_an_exposed_one(
+    key, network
+):
+    places = typical_lidars(make_env("Goal-Hazard-Point"), jax.random.key(1), 256)
+    theta = graded_start(key, 200, 8.0, places, network)
+    costs = np.asarray(jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta))
+    middle, loud = np.percentile(costs, [50, 90], axis=1)
+    np.testing.assert_allclose(middle, QUIET_COST, rtol=0.05)
+    low, high = LOUD_COSTS
+    inside = (loud > 0.9 * low) & (loud < 1.1 * high)
+    assert inside.mean() > 0.9  # the others' units are all but off
+    share = np.log(loud[inside] / low) / np.log(high / low)
+    np.testing.assert_allclose(share.mean(), 0.5, atol=SIGMAS * 0.29 / 200**0.5)
+    nearer = jax.vmap(lambda theta: intrinsic_cost(theta, 1.1 * places))(theta)
+    assert bool((nearer >= costs).all())
 
 
 def test_children_stay_as_loud_as_their_parents(key):
@@ -187,12 +208,15 @@ def test_children_are_adjusted_and_elites_are_not(key):
     assert not later[elites:].any()
 
 
-def test_a_search_hands_its_world_to_its_options(key):
+@pytest.mark.parametrize("start", ["monotone", "graded"])
+@pytest.mark.parametrize("network", ["dense", "shared"])
+def test_a_search_hands_its_world_to_its_options(key, start, network):
     config = preset("smoke")
     env = dataclasses.replace(config.train.env, physics="closed_form")
     train = dataclasses.replace(config.train, env=env)
     sizes = {"population_size": 12, "num_elites": 2, "num_stages": 2, "init_std": 8.0}
-    options = {"start": "monotone", "keep_level": True, "mutation_std": 0.01}
+    options = {"start": start, "keep_level": True, "mutation_std": 0.01}
+    options |= {"network": network}
     es = _strategy(dataclasses.replace(config, train=train, **sizes, **options))
     first = es.ask(key, es.init())
     fitness = make_fitness(range(12), [1.0] * 12)

@@ -153,6 +153,7 @@ def test_the_tables_are_those_of_the_committed_json(script, result):
         "--start",
         "--return-floor",
         "--judge-by",
+        "--network",
     ],
 )
 def test_flags_of_the_readme_exist(flag, capsys):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from autocost_jax import report, scene
+from autocost_jax.costs import intrinsic_cost
 from autocost_jax.env_config import EnvConfig
 from autocost_jax.scene import Recording
 from pages import browse, check_page
@@ -154,6 +155,13 @@ def test_network_golden():
     )
     expected = [0.3595359, 0.2230037, 0.4558284, 0.3534252]
     np.testing.assert_allclose(got, expected, atol=TOL)
+
+
+def test_the_shared_network_is_that_of_the_costs():
+    theta, lidar = 0.3 * golden_theta()[:13], np.linspace(0, 1, 24).reshape(3, 8)
+    got = report.network_cost(theta, lidar)
+    np.testing.assert_allclose(got, intrinsic_cost(theta, lidar), atol=TOL)
+    assert np.ptp(got) > 0.01
 
 
 def test_network_is_finite_for_huge_parameters():
