@@ -68,6 +68,10 @@ class Round(NamedTuple):
       scale: of the training.
       seeds: of the agents, one slot each.
       episodes: fresh ones that an agent is scored in.
+      rules: whose costs take part; the round before decides which if it has the same.
+      judge: of `JUDGES`, by which the costs are ranked.
+      floor: return that a cost must reach there.
+      winner: what the best is called in the package; "" if another round decides.
     """
 
     name: str
@@ -75,6 +79,10 @@ class Round(NamedTuple):
     scale: str
     seeds: tuple[int, ...]
     episodes: int
+    rules: tuple[str, ...]
+    judge: str
+    floor: float
+    winner: str = ""
 
 
 class Plan(NamedTuple):
@@ -82,23 +90,20 @@ class Plan(NamedTuple):
 
     Attributes:
       size: flags that all of them share.
-      judge: of `JUDGES`, where the best of all searches are ranked.
-      floor: return that a cost must reach there.
       rules: flags and seeds of each rule.
-      entered: the rules whose costs take part in the rounds.
       rounds: what decides about the best of them.
-      winner: what it is called in the package.
       size_text: for the picture.
     """
 
     size: tuple[str, ...]
-    judge: str
-    floor: float
     rules: dict[str, tuple[tuple[str, ...], tuple[int, ...]]]
-    entered: tuple[str, ...]
     rounds: tuple[Round, ...]
-    winner: str
     size_text: str
+
+    @property
+    def floor(self) -> float:
+        """Return of both agents from which a candidate counts as useful in tables."""
+        return self.rounds[0].floor
 
 
 def guided(floor: float, *more: str, start: str = "monotone") -> tuple[str, ...]:
@@ -114,6 +119,8 @@ def shared(floor: float) -> tuple[str, ...]:
 
 
 FRESH = (100, 101, 102, 103, 104)
+DENSE = (("guided", "paper", "raw"), "mean", 2.0)  # who enters a round, how ranked
+SHARED = (("shared",), "worst", 2.0)
 SMALL = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "12")
 SMALL += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
 SMALL += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
@@ -122,30 +129,32 @@ LARGE += ("--num-epochs", "96", "--chunk-epochs", "8", "--eval-episodes", "1000"
 PLANS = {
     "reduced": Plan(
         SMALL,
-        "mean",
-        2.0,
         {
             "guided": (guided(2.0, "--keep-level"), (0, 1, 2)),
             "paper": ((), (0, 1, 2)),
             "raw": (guided(2.0), (0,)),
             "shared": (shared(2.0), (0, 1, 2)),
         },
-        ("guided", "paper", "raw"),
         (
-            Round("shortlist", 16, "reduced", (200, 201), 100),
-            Round("validation", 4, "reduced_2m", FRESH, 200),
+            Round("shortlist", 16, "reduced", (200, 201), 100, *DENSE),
+            Round("validation", 4, "reduced_2m", FRESH, 200, *DENSE, paper.EVOLVED),
+            Round("shared_shortlist", 5, "reduced_2m", (200, 201), 100, *SHARED),
+            Round(
+                *("shared_validation", 1, "reduced_10m", FRESH, 200),
+                *(*SHARED, "ic4srl_shared"),
+            ),
         ),
-        paper.EVOLVED,
         "12 candidates, 512,000 steps a slot; 80 episodes a dot and algorithm",
     ),
     "reduced_10m": Plan(
         LARGE,
-        "worst",
-        2.5,
         {"guided": (guided(4.0, "--keep-level"), (0,))},
-        ("guided",),
-        (Round("validation", 9, "reduced_10m", FRESH, 200),),
-        "ic4srl",
+        (
+            Round(
+                *("validation", 9, "reduced_10m", FRESH, 200),
+                *(("guided",), "worst", 2.5, "ic4srl"),
+            ),
+        ),
         "50 candidates, 2,880,000 steps a slot; 300 episodes a dot and algorithm",
     ),
 }
@@ -179,21 +188,21 @@ def finished(runs: Path, plan: Plan) -> list[tuple[str, int, Path]]:
     return [row for row in paths if (row[2] / "cost.json").exists()]
 
 
-def entered(runs: Path, plan: Plan) -> list[tuple[str, int, Path]]:
-    """Those of them whose costs take part in the rounds."""
-    return [row for row in finished(runs, plan) if row[0] in plan.entered]
+def entered(runs: Path, plan: Plan, part: Round) -> list[tuple[str, int, Path]]:
+    """Those of them whose costs take part in a round."""
+    return [row for row in finished(runs, plan) if row[0] in part.rules]
 
 
-def candidates(runs: Path, plan: Plan) -> list[dict[str, Any]]:
-    """What all searches have found, best first, ranked as one population.
+def candidates(runs: Path, plan: Plan, part: Round) -> list[dict[str, Any]]:
+    """What the searches of a round have found, best first, ranked as one population.
 
     The guided search's order: useful ones first, of them the safest. An elite that was
     trained again counts once, with the mean of its scores, so that one lucky stage
     does not carry it.
     """
-    of_costs, of_returns = JUDGES[plan.judge]
+    of_costs, of_returns = JUDGES[part.judge]
     found: dict[bytes, list[dict[str, Any]]] = {}
-    for rule, seed, path in entered(runs, plan):
+    for rule, seed, path in entered(runs, plan, part):
         for stage, file in list_stages(path).items():
             arrays = load_arrays(file)
             costs = of_costs(arrays["scores/ep_cost"], 0)
@@ -213,7 +222,7 @@ def candidates(runs: Path, plan: Plan) -> list[dict[str, Any]]:
         for group in found.values()
     ]
     costs, returns = ([row[key] for row in rows] for key in ("cost", "ep_return"))
-    return [rows[i] for i in guided_order(costs, returns, plan.floor)]
+    return [rows[i] for i in guided_order(costs, returns, part.floor)]
 
 
 def guided_order(
@@ -227,8 +236,8 @@ def guided_order(
 def validate(args: argparse.Namespace) -> None:
     """All rounds, one after the other."""
     plan = PLANS[args.scale]
-    for index, (name, _, scale_name, seeds, episodes) in enumerate(plan.rounds):
-        scale = paper.scales()["smoke" if args.smoke else scale_name]
+    for index, part in enumerate(plan.rounds):
+        scale = paper.scales()["smoke" if args.smoke else part.scale]
         config = paper.table(paper.TRAINING_WORLD, ["extrinsic"], scale)
         methods = tuple(
             Method(f"{i}-{algorithm}", algorithm, paper.WITH_NETWORK, 0.0, theta)
@@ -236,24 +245,27 @@ def validate(args: argparse.Namespace) -> None:
             for algorithm in paper.BOTH
             for theta in [tuple(row["theta"].tolist())]
         )
-        seeds = scale.seeds if args.smoke else seeds
+        seeds = scale.seeds if args.smoke else part.seeds
         config = dataclasses.replace(config, methods=methods, seeds=seeds)
-        episodes = scale.episodes if args.smoke else episodes
-        run_if_needed(config, args.runs / name, episodes)
+        episodes = scale.episodes if args.smoke else part.episodes
+        run_if_needed(config, args.runs / part.name, episodes)
 
 
 def entrants(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
     """Who takes part in a round: the best of the round before, or of the searches."""
-    ranked = scored(runs, plan, index - 1) if index else candidates(runs, plan)
-    return ranked[: plan.rounds[index].entrants]
+    part = plan.rounds[index]
+    follows = index > 0 and plan.rounds[index - 1].rules == part.rules
+    ranked = scored(runs, plan, index - 1) if follows else candidates(runs, plan, part)
+    return ranked[: part.entrants]
 
 
 def scored(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
     """The entrants of a round that was run with their scores in it, best first.
 
-    Both algorithms together as `Plan.judge` says, ranked as the guided search ranks.
+    Both algorithms together as `Round.judge` says, ranked as the guided search ranks.
     """
-    name = plan.rounds[index].name
+    part = plan.rounds[index]
+    name = part.name
     path = runs / name
     config = read_config(path, TableConfig)[0]
     rows = json.loads((path / "evaluation.json").read_text())["rows"]
@@ -274,27 +286,35 @@ def scored(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
         scores = [row[name].values() for row in result]
         return [float(judge([s[key]["mean"] for s in row])) for row in scores]
 
-    of_costs, of_returns = JUDGES[plan.judge]
+    of_costs, of_returns = JUDGES[part.judge]
     costs, returns = judged("cost", of_costs), judged("return", of_returns)
-    return [result[i] for i in guided_order(costs, returns, plan.floor)]
+    return [result[i] for i in guided_order(costs, returns, part.floor)]
 
 
 def ship(args: argparse.Namespace) -> None:
-    """Write the winner and three runners-up, and the winner into the package."""
+    """Write winners and up to three runners-up, and the winners into the package."""
     plan, where = PLANS[args.scale], args.results / "costs"
     where.mkdir(parents=True, exist_ok=True)
-    for place, row in enumerate(scored(args.runs, plan, len(plan.rounds) - 1)[:4]):
-        config, facts = read_config(folder(args.runs, row["rule"], row["seed"]))
-        name = f"runner_up_{place}" if place else plan.winner
-        card = make_card(row, plan, config) | {"commit": facts["commit"]}
-        save_cost(where / name, row["theta"], to_json(card))
-        if place == 0 and not args.smoke:
-            SHIPPED.mkdir(exist_ok=True)
-            save_cost(SHIPPED / name, row["theta"], to_json(card))
-        print(name, card["found"], json.dumps(card["validation"]))
+    for index, part in enumerate(plan.rounds):
+        if not part.winner or not was_run(args.runs, part):
+            continue
+        for place, row in enumerate(scored(args.runs, plan, index)[:4]):
+            config, facts = read_config(folder(args.runs, row["rule"], row["seed"]))
+            name = f"runner_up_{place}" if place else part.winner
+            card = make_card(row, part, config) | {"commit": facts["commit"]}
+            save_cost(where / name, row["theta"], to_json(card))
+            if place == 0 and not args.smoke:
+                SHIPPED.mkdir(exist_ok=True)
+                save_cost(SHIPPED / name, row["theta"], to_json(card))
+            print(name, card["found"], json.dumps(card["validation"]))
 
 
-def make_card(row: dict[str, Any], plan: Plan, config: SearchConfig) -> dict[str, Any]:
+def was_run(runs: Path, part: Round) -> bool:
+    """Whether a round is finished."""
+    return (runs / part.name / "evaluation.json").exists()
+
+
+def make_card(row: dict[str, Any], part: Round, config: SearchConfig) -> dict[str, Any]:
     """How a cost was found, its scores on fresh seeds, and where it fails."""
     validation = {
         algorithm: {
@@ -302,22 +322,23 @@ def make_card(row: dict[str, Any], plan: Plan, config: SearchConfig) -> dict[str
             for key, value in score.items()
             if key in ("return", "cost", "episodes") or key.startswith("violation")
         }
-        for algorithm, score in row["validation"].items()
+        for algorithm, score in row[part.name].items()
     }
-    last = plan.rounds[-1]
-    steps = paper.steps_a_slot(paper.scales()[last.scale].train)
+    steps = paper.steps_a_slot(paper.scales()[part.scale].train)
+    chosen = "it was not chosen by these"
+    if part.entrants > 1:
+        chosen = f"it was chosen among {part.entrants} on these, so they flatter it"
     violates = [paper.NAMES[a] for a, s in validation.items() if s["violations"]]
     return {
         "found": f"{row['rule']} search, seed {row['seed']}, stage {row['stage'] + 1}, "
         f"candidate {row['index']}",
         "environment": config.train.env.name,
         "budget": f"{config.env_steps:,} env steps a search, reduced scale",
-        "judged_by": f"the {plan.judge} of the two algorithms; a return of at least "
-        f"{plan.floor:g}, then the cost",
+        "judged_by": f"the {part.judge} of the two algorithms; a return of at least "
+        f"{part.floor:g}, then the cost",
         "search": {key: row[key] for key in ("cost", "ep_return", "times_trained")},
         "validation": validation,
-        "validated_on": f"training seeds {last.seeds}, {steps:,} steps each; it was "
-        f"chosen among {last.entrants} on these, so they flatter it a little",
+        "validated_on": f"training seeds {part.seeds}, {steps:,} steps each; {chosen}",
         "fails": f"not free of violations under {' and '.join(violates)}"
         if violates
         else "no violation seen in validation; see the rates' upper bounds",
@@ -352,10 +373,11 @@ def collect(args: argparse.Namespace) -> None:
         "size": plan.size_text,
         "floor": plan.floor,
         "loudness": by_loudness(args.runs, plan),
-        "distance": by_distance(winner(args)),
+        "distance": {file.name: by_distance(file) for file in winners(args)},
+        "rounds": [part.name for part in plan.rounds if was_run(args.runs, part)],
     }
     for index, part in enumerate(plan.rounds):
-        if (args.runs / part.name / "evaluation.json").exists():
+        if was_run(args.runs, part):
             result[part.name] = [
                 {key: value for key, value in row.items() if key != "theta"}
                 for row in scored(args.runs, plan, index)
@@ -364,7 +386,7 @@ def collect(args: argparse.Namespace) -> None:
     file = paper.write(result, "evolution", args.results)
     file.with_suffix(".md").write_text(searches_tables.render(result))
     searches_tables.draw(result, file.with_suffix(".png"))
-    draw_heat_map(args)
+    draw_heat_maps(args)
     print(file)
 
 
@@ -378,21 +400,30 @@ def both(stages: Sequence[dict[str, Any]]) -> Iterator[tuple[str, list[np.ndarra
         yield f"{prefix}return", [row.round(4) for row in returns]
 
 
-def by_loudness(runs: Path, plan: Plan) -> list[dict[str, Any]]:
+def by_loudness(runs: Path, plan: Plan) -> dict[str, list[dict[str, Any]]]:
     """Mean fitness of all that was trained, by the cost of a step near a hazard.
 
-    That of the states which the candidate's own agents have visited.
+    That of the states which the candidate's own agents have visited; the rules of a
+    round together.
     """
-    tables = [
-        load_arrays(file)
-        for _, _, path in entered(runs, plan)
-        for file in list_stages(path).values()
-    ]
-    if not tables:
-        return []
+    tables = {
+        ", ".join(part.rules): [
+            load_arrays(file)
+            for _, _, path in entered(runs, plan, part)
+            for file in list_stages(path).values()
+        ]
+        for part in plan.rounds
+    }
+    return {rules: binned(table) for rules, table in tables.items() if table}
+
+
+def binned(tables: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mean fitness by `LOUDNESS` of the candidates of some stages."""
     cost, gain, near = (
-        np.concatenate([np.atleast_2d(table[name]).mean(0) for table in tables])
-        for name in ("cost", "ep_return", "scores/intrinsic_near")
+        np.concatenate(
+            [np.atleast_2d(table[f"scores/{name}"]).mean(0) for table in tables]
+        )
+        for name in ("ep_cost", "ep_return", "intrinsic_near")
     )
     rows = []
     for low, high in itertools.pairwise(LOUDNESS):
@@ -403,15 +434,15 @@ def by_loudness(runs: Path, plan: Plan) -> list[dict[str, Any]]:
     return rows
 
 
-def winner(args: argparse.Namespace) -> Path:
-    """The file of the shipped cost, without its suffix."""
-    return args.results / "costs" / PLANS[args.scale].winner
+def winners(args: argparse.Namespace) -> list[Path]:
+    """The files of the shipped costs, without their suffix."""
+    names = [part.winner for part in PLANS[args.scale].rounds if part.winner]
+    files = [args.results / "costs" / name for name in names]
+    return [file for file in files if file.with_suffix(".npz").exists()]
 
 
 def by_distance(file: Path, num_places: int = 8192) -> list[dict[str, Any]]:
     """A cost at random places of its world, by the distance to the closest hazard."""
-    if not file.with_suffix(".npz").exists():
-        return []
     env = make_env(paper.TRAINING_WORLD)
     keys = jax.random.split(jax.random.key(0), num_places)
     layout = jax.jit(jax.vmap(env.reset))(keys).layout
@@ -429,13 +460,13 @@ def by_distance(file: Path, num_places: int = 8192) -> list[dict[str, Any]]:
     return rows
 
 
-def draw_heat_map(args: argparse.Namespace) -> None:
-    """The shipped cost around one hazard, as in the paper."""
+def draw_heat_maps(args: argparse.Namespace) -> None:
+    """The shipped costs around one hazard, as in the paper."""
     from autocost_jax.report_assets.figures import heat_map
 
-    if winner(args).with_suffix(".npz").exists():
-        picture = heat_map(np.asarray(load_cost(winner(args))), radius=0.3)
-        picture.savefig(args.results / "heat_map.png", dpi=130)
+    for file in winners(args):
+        picture = heat_map(np.asarray(load_cost(file)), radius=0.3)
+        picture.savefig(args.results / f"heat_map_{file.name}.png", dpi=130)
 
 
 PARTS = {"run": run, "validate": validate, "ship": ship, "collect": collect}

@@ -34,38 +34,41 @@ def render(result: dict[str, Any]) -> str:
             f"| {', '.join(str(len(costs)) for costs in useful)} "
             f"| {', '.join(f'{min(c):.2f}' if c else '-' for c in useful)} |"
         )
-    lines += [
-        "",
-        "| cost of a step near a hazard | trained | mean cost | mean return |",
-        "|---|---|---|---|",
-    ]
-    for row in result["loudness"]:
-        lines.append(
-            f"| {row['low']} to {row['high']} | {row['count']} | {row['cost']:.1f} "
-            f"| {row['return']:.1f} |"
-        )
-    lines += [
-        "",
-        "| distance to the closest hazard | shipped cost of a step | 10 % to 90 % |",
-        "|---|---|---|",
-    ]
-    for row in result["distance"]:
-        lines.append(
-            f"| {row['low']:g} to {row['high']:g} m | {row['mean']:.4f} "
-            f"| {row['p10']:.4f} to {row['p90']:.4f} |"
-        )
-    for name in ("shortlist", "validation"):
-        if name in result:
-            lines += ["", *render_round(name, result[name])]
+    for rules, rows in result["loudness"].items():
+        lines += [
+            "",
+            f"| {rules}: cost of a step near a hazard "
+            "| trained | mean cost | mean return |",
+            "|---|---|---|---|",
+        ]
+        for row in rows:
+            lines.append(
+                f"| {row['low']} to {row['high']} | {row['count']} | {row['cost']:.1f} "
+                f"| {row['return']:.1f} |"
+            )
+    for name, rows in result["distance"].items():
+        lines += [
+            "",
+            f"| distance to the closest hazard | {name}: cost of a step "
+            "| 10 % to 90 % |",
+            "|---|---|---|",
+        ]
+        for row in rows:
+            lines.append(
+                f"| {row['low']:g} to {row['high']:g} m | {row['mean']:.4f} "
+                f"| {row['p10']:.4f} to {row['p90']:.4f} |"
+            )
+    for name in result["rounds"]:
+        lines += ["", *render_round(name.replace("_", " "), name, result[name])]
     return "\n".join(lines) + "\n"
 
 
-def render_round(name: str, rows: list[dict[str, Any]]) -> list[str]:
+def render_round(title: str, name: str, rows: list[dict[str, Any]]) -> list[str]:
     """The entrants of a round, best first."""
     columns = ("return (95 %)", "cost (95 %)", "violating (at most)")
     heads = [f"{paper.NAMES[a]}: {c}" for a in paper.BOTH for c in columns]
     lines = [
-        f"| {name} | search: cost, return | {' | '.join(heads)} |",
+        f"| {title} | search: cost, return | {' | '.join(heads)} |",
         "|---" * (2 + len(heads)) + "|",
     ]
     for row in rows:

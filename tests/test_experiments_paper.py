@@ -262,7 +262,7 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     returns = [[-3.0, 5.0, 1.0, 9.0], [7.0, 6.0, 5.0, 4.0]]
     runs = tmp_path / "runs"
     theta = write_search(runs, costs, returns)
-    ranked = searches.candidates(runs, PLAN)
+    ranked = searches.candidates(runs, PLAN, PLAN.rounds[0])
     assert [row["index"] for row in ranked] == [1, 1, 2, 3, 3, 2, 0]
     assert (ranked[0]["cost"], ranked[0]["times_trained"]) == (2.0, 2)
     worse = [[(9.0, 4.0 + i, 60)] * 2 for i in range(5)]
@@ -288,7 +288,7 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     assert "| 0.3 to 1.0 | 2 | 7.5 | 6.5 |" in table
     assert "| shortlist |" in table
     assert "| validation |" in table
-    assert (tmp_path / "heat_map.png").exists()
+    assert (tmp_path / "heat_map_ic4srl_reduced.png").exists()
     assert (tmp_path / "evolution.png").exists()
 
 
@@ -302,7 +302,7 @@ def test_the_worse_of_two_agents_can_decide(tmp_path):
     write_round(runs, 0, scores)
     first = searches.entrants(runs, PLAN, 0)
     for judge, expect in (("mean", [0, 2, 1]), ("worst", [1, 2, 3])):
-        plan = PLAN._replace(judge=judge)
+        plan = PLAN._replace(rounds=(PLAN.rounds[0]._replace(judge=judge),))
         ranked = searches.scored(runs, plan, 0)[:3]
         assert [row["theta"].tolist() for row in ranked] == [
             first[i]["theta"].tolist() for i in expect
