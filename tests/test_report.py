@@ -2,6 +2,7 @@ import dataclasses
 import html
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -160,7 +161,8 @@ def test_network_golden():
 def test_the_shared_network_is_that_of_the_costs():
     theta, lidar = np.linspace(-2, 1, 13), np.linspace(0, 1, 24).reshape(3, 8)
     got = report.network_cost(theta, lidar)
-    np.testing.assert_allclose(got, intrinsic_cost(theta, lidar), atol=TOL)
+    expected = intrinsic_cost(jnp.asarray(theta), jnp.asarray(lidar))
+    np.testing.assert_allclose(got, expected, atol=TOL)
     assert np.ptp(got) > 0.01
 
 
