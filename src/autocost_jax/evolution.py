@@ -37,9 +37,8 @@ TRACKED = (
     "intrinsic_far",
     "intrinsic_near",
 )
-# How the first candidates are drawn; None: the strategy's own N(0, init_std^2).
-STARTS: dict[Start, Callable[..., jax.Array] | None] = {
-    "normal": None,
+# How the first candidates are drawn, if not from N(0, init_std^2).
+STARTS: dict[Start, Callable[..., jax.Array]] = {
     "monotone": es_lib.monotone_start,
     "graded": es_lib.graded_start,
 }
@@ -251,8 +250,7 @@ def stage_functions(
 
 def _strategy(config: SearchConfig) -> ES:
     """The strategy with the options that look at the world's typical places."""
-    first = STARTS[config.start]
-    if first is None and not config.keep_level:
+    if config.start == "normal" and not config.keep_level:
         return truncation_es(config)
     env = make_env(config.train.env)
 
@@ -261,7 +259,7 @@ def _strategy(config: SearchConfig) -> ES:
 
     def start(key: Key) -> jax.Array:
         size, std = config.population_size, config.init_std
-        return first(key, size, std, lidars(), config.network)
+        return STARTS[config.start](key, size, std, lidars(), config.network)
 
     def adjust(key: Key, elites: jax.Array, children: jax.Array) -> jax.Array:
         std = config.mutation_std
@@ -269,7 +267,7 @@ def _strategy(config: SearchConfig) -> ES:
 
     return truncation_es(
         config,
-        None if first is None else start,
+        start if config.start in STARTS else None,
         adjust if config.keep_level else None,
     )
 
