@@ -6,7 +6,7 @@ Axes, used in every docstring of the package:
     T  steps             O  observation              U  action
     H  hazards           Q  pillars                  V  vases
     B  lidar bins (8)    M  objects of a list
-    D  parameters of the cost (41 or 13)            K  terms of the cost bank
+    D  parameters of the cost (41 or 13)             K  terms of the cost bank
 
 Lengths are metres, angles radians, times seconds.
 """
