@@ -10,10 +10,11 @@ from N(0, 5^2) and selects and mutates as the paper does. "guided" starts from c
 that rise as anything comes nearer (`es.monotone_start`, std 8), ranks candidates whose
 return is below a floor behind all others (`es.rank`), and lets no mutation change how
 loud a cost is at a typical place (`es.keep_level`). "raw" is guided with the paper's
-mutations. "shared" searches among networks that treat all bins of the lidar alike,
-starts from costs of a set loudness (`es.graded_start`), and judges a candidate by the
-worse of its two agents, not by their mean; else it is guided. Sizes, seeds and rounds
-are in `PLANS`; `--scale reduced_10m` wants a GPU, `--smoke` is for tests.
+mutations. "nearest" is no evolution: it trains one stage of costs that see only how
+near the closest object is, of a set loudness (`es.graded_start`), four times as long
+as a stage of the others, and judges them by the worse of their two agents, not by the
+mean. Sizes, seeds and rounds are in `PLANS`; `--scale reduced_10m` wants a GPU,
+`--smoke` is for tests.
 
 What looks best in a search is partly lucky, so the best of all searches go through
 rounds of agents with fresh seeds: many of them briefly, the best of these for longer.
@@ -112,15 +113,16 @@ def guided(floor: float, *more: str, start: str = "monotone") -> tuple[str, ...]
     return (*first, "--return-floor", str(floor), *more)
 
 
-def shared(floor: float) -> tuple[str, ...]:
-    """Flags of a search among networks that treat all bins of the lidar alike."""
-    more = ("--keep-level", "--judge-by", "worst", "--network", "shared")
+def nearest(floor: float) -> tuple[str, ...]:
+    """Flags of a longer stage of costs that see only how near the closest object is."""
+    size = ("--num-stages", "1", "--num-epochs", "256", "--fitness-epochs", "40")
+    more = ("--judge-by", "worst", "--network", "nearest", *size)
     return guided(floor, *more, start="graded")
 
 
 FRESH = (100, 101, 102, 103, 104)
 DENSE = (("guided", "paper", "raw"), "mean", 2.0)  # who enters a round, how ranked
-SHARED = (("shared",), "worst", 2.0)
+NEAREST = (("nearest",), "worst", 2.0)
 SMALL = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "12")
 SMALL += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
 SMALL += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
@@ -133,15 +135,14 @@ PLANS = {
             "guided": (guided(2.0, "--keep-level"), (0, 1, 2)),
             "paper": ((), (0, 1, 2)),
             "raw": (guided(2.0), (0,)),
-            "shared": (shared(2.0), (0, 1, 2)),
+            "nearest": (nearest(2.0), (0,)),
         },
         (
             Round("shortlist", 16, "reduced", (200, 201), 100, *DENSE),
             Round("validation", 4, "reduced_2m", FRESH, 200, *DENSE, paper.EVOLVED),
-            Round("shared_shortlist", 5, "reduced_2m", (200, 201), 100, *SHARED),
             Round(
-                *("shared_validation", 1, "reduced_10m", FRESH, 200),
-                *(*SHARED, "ic4srl_shared"),
+                *("nearest_validation", 2, "reduced_10m", FRESH, 200),
+                *(*NEAREST, "ic4srl_nearest"),
             ),
         ),
         "12 candidates, 512,000 steps a slot; 80 episodes a dot and algorithm",

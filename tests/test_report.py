@@ -158,7 +158,7 @@ def test_network_golden():
     np.testing.assert_allclose(got, expected, atol=TOL)
 
 
-def test_the_shared_network_is_that_of_the_costs():
+def test_the_nearest_network_is_that_of_the_costs():
     theta, lidar = np.linspace(-2, 1, 13), np.linspace(0, 1, 24).reshape(3, 8)
     got = report.network_cost(theta, lidar)
     expected = intrinsic_cost(jnp.asarray(theta), jnp.asarray(lidar))

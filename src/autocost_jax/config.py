@@ -24,8 +24,8 @@ Selection = Literal["paper", "random"]
 Start = Literal["normal", "monotone", "graded"]
 Judge = Literal["mean", "worst"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
-CostNetwork = Literal["dense", "shared"]
-THETA_SIZES: dict[CostNetwork, int] = {"dense": 41, "shared": 13}
+CostNetwork = Literal["dense", "nearest"]
+THETA_SIZES: dict[CostNetwork, int] = {"dense": 41, "nearest": 13}
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,8 @@ class SearchConfig:
     return ranks behind all others, however safe it is, see `es.rank`. A candidate is
     judged by the mean over its algorithms, or with `judge_by="worst"` by their highest
     cost and lowest return: under a mean one algorithm may flee while the other drives.
-    With `network="shared"` candidates are networks of 13 parameters that treat all bins
-    of the lidar alike, see `costs.intrinsic_logit`; "dense" is the paper's, of 41.
+    With `network="nearest"` candidates are networks of 13 parameters that see only how
+    near the closest object is, see `costs.intrinsic_logit`; "dense" is the paper's.
     """
 
     train: TrainConfig = field(default_factory=TrainConfig)

@@ -20,7 +20,6 @@ import numpy as np
 
 from autocost_jax.arrays import load_arrays
 from autocost_jax.config import THETA_SIZES
-from autocost_jax.env_config import LIDAR_BINS
 from autocost_jax.records import CostInputs, TrainingCost
 
 HIDDEN = 4  # the paper's hidden layer: 8 * 4 + 4 + 4 + 1 = 41 parameters
@@ -44,7 +43,7 @@ def intrinsic_cost(theta: jax.Array, lidar: jax.Array) -> jax.Array:
 
     Args:
       theta: [41] parameters: W1 [8, 4] row-major, b1 [4], W2 [4], b2; or [13]: a W1
-        [1, 4] that all bins share, see `intrinsic_logit`.
+        [1, 4] of the highest reading alone, see `intrinsic_logit`.
       lidar: [..., 8] the constraint lidar of the post-step state.
 
     Returns:
@@ -59,22 +58,19 @@ def intrinsic_cost(theta: jax.Array, lidar: jax.Array) -> jax.Array:
 def intrinsic_logit(theta: jax.Array, lidar: jax.Array) -> jax.Array:
     """What the output sigmoid of `intrinsic_cost` is taken of, [...].
 
-    With a theta of 41 the paper's network. With one of 13 (ours) each bin i goes
-    through the same hidden layer, W2 sum_i sigmoid(W1 lidar_i + b1) + b2: turning the
-    robot by one bin changes nothing, so that a cost cannot be silent on one side, and
-    it takes one steep unit to tell whether anything is nearer than some distance.
+    With a theta of 41 the paper's network. With one of 13 (ours) the same with the
+    highest of the eight readings as its only input, which the distance D of the closest
+    object decides: exp(-D). It can say what a safety margin says, and cannot be silent
+    on one side of the robot.
     """
     split = theta.shape[-1] - 2 * HIDDEN - 1
     w1 = theta[:split].reshape(-1, HIDDEN)
     b1, w2, b2 = theta[split : split + HIDDEN], theta[split + HIDDEN : -1], theta[-1]
-    # Bins first: eight multiply-adds fuse where a [.., 8] x [8, 4] matmul would not.
-    bins = [lidar[..., i, None] for i in range(LIDAR_BINS)]
     if w1.shape[0] == 1:
-        hidden = sum(jax.nn.sigmoid(b1 + reading * w1[0]) for reading in bins)
-    else:
-        pre = b1 + sum(reading * w for reading, w in zip(bins, w1, strict=True))
-        hidden = jax.nn.sigmoid(pre)
-    return jnp.sum(hidden * w2, axis=-1) + b2
+        lidar = lidar.max(-1, keepdims=True)
+    # Bins first: eight multiply-adds fuse where a [.., 8] x [8, 4] matmul would not.
+    pre = b1 + sum(lidar[..., i, None] * w1[i] for i in range(w1.shape[0]))
+    return jnp.sum(jax.nn.sigmoid(pre) * w2, axis=-1) + b2
 
 
 def _extrinsic(inputs: CostInputs, theta: jax.Array) -> jax.Array:

@@ -20,8 +20,9 @@ from autocost_jax.config import THETA_SIZES, CostNetwork, SearchConfig
 from autocost_jax.costs import HIDDEN, intrinsic_logit
 from autocost_jax.records import Key
 
-QUIET_COST = 1e-4  # of a `monotone_start` or `graded_start` at a typical place
-LOUD_COSTS = (0.01, 0.5)  # of a `graded_start` at an exposed place
+QUIET_COST = 1e-4  # of a `monotone_start` at a typical place, or a `graded_start`
+QUIET_PLACES = (10.0, 50.0)  # percentiles; where a `graded_start` is quiet
+LOUD_COSTS = (0.01, 0.5)  # of a `graded_start` at the 70th percentile
 
 
 class Fitness(struct.PyTreeNode):
@@ -204,8 +205,7 @@ def monotone_start(
       theta [P, D].
     """
     inner, bias, outer = _random_parts(key, num, std, network)
-    rows = inner.shape[1]
-    typical = lidars.mean(0).reshape(rows, -1).mean(1)
+    typical = _readings(lidars, network).mean(0)
     bias = bias - jnp.einsum("b,pbh->ph", typical, inner)
     theta = _join_parts(inner, bias, outer, jnp.zeros(num))
     quiet = _logit(QUIET_COST) - jnp.median(_logits(theta, lidars), axis=1)
@@ -222,10 +222,10 @@ def graded_start(
     """Random monotone costs of a set loudness; not the paper's start.
 
     As `monotone_start`, but each hidden unit turns on where one of the typical places
-    has its readings (the shared network: its highest one), and the output layer is
-    scaled so that the cost is 1e-4 at the median place and log-uniform in [0.01, 0.5]
-    at the 90th percentile: most of a `monotone_start` is silent everywhere or so loud
-    that agents flee, whatever its shape.
+    has its readings, and the output layer is scaled so that over all of them the cost
+    is 1e-4 at a percentile uniform in [10, 50] and log-uniform in [0.01, 0.5] at the
+    70th: most of a `monotone_start` is silent everywhere or so loud that agents flee,
+    whatever its shape.
 
     Args:
       key: consumed.
@@ -237,15 +237,17 @@ def graded_start(
     Returns:
       theta [P, D].
     """
-    key_parts, key_place, key_level = jax.random.split(key, 3)
+    key_parts, key_place, key_quiet, key_level = jax.random.split(key, 4)
     inner, _, outer = _random_parts(key_parts, num, std, network)
     index = jax.random.randint(key_place, (num, HIDDEN), 0, lidars.shape[0])
-    if network == "shared":
-        bias = -inner[:, 0] * lidars.max(1)[index]
-    else:
-        bias = -jnp.einsum("phb,pbh->ph", lidars[index], inner)
-    theta = _join_parts(inner, bias, outer, jnp.zeros(num))
-    low, high = jnp.percentile(_logits(theta, lidars), jnp.array([50, 90]), axis=1)
+    places = _readings(lidars, network)[index]
+    bias = -jnp.einsum("phb,pbh->ph", places, inner)
+    logits = _logits(_join_parts(inner, bias, outer, jnp.zeros(num)), lidars)
+    quiet = jax.random.uniform(
+        key_quiet, (num,), minval=QUIET_PLACES[0], maxval=QUIET_PLACES[1]
+    )
+    low = jax.vmap(jnp.percentile)(logits, quiet)
+    high = jnp.percentile(logits, 70, axis=1)
     low_level, high_level = (jnp.log(cost) for cost in LOUD_COSTS)
     level = jax.random.uniform(key_level, (num,), minval=low_level, maxval=high_level)
     contrast = jnp.maximum(high - low, 0.01 * outer.sum(1))  # units may be all but off
@@ -270,6 +272,11 @@ def _join_parts(
     """Theta [P, D] of its parts, the last one [P]."""
     parts = (inner.reshape(len(inner), -1), bias, outer, last[:, None])
     return jnp.concatenate(parts, axis=1)
+
+
+def _readings(lidars: jax.Array, network: CostNetwork) -> jax.Array:
+    """What the rows of W1 are multiplied with, [M, rows]."""
+    return lidars if network == "dense" else lidars.max(1, keepdims=True)
 
 
 def _logits(theta: jax.Array, lidars: jax.Array) -> jax.Array:

@@ -45,7 +45,7 @@ def network_cost(theta: Array, lidar: Array) -> Array:
 
         c = sigmoid(W2 . sigmoid(W1 l + b1) + b2)
 
-    With one row in W1 all bins share it, and their hidden layers are added up.
+    With one row in W1 the highest reading is the only input.
 
     Args:
       theta: [41] W1 row-major 8 x 4, b1, W2, b2; or [13] with a W1 of 1 x 4.
@@ -57,11 +57,9 @@ def network_cost(theta: Array, lidar: Array) -> Array:
     theta = np.asarray(theta, float)
     end = len(theta) - HIDDEN - 1
     w1, b1 = theta[: end - HIDDEN].reshape(-1, HIDDEN), theta[end - HIDDEN : end]
-    if len(w1) == LIDAR_BINS:
-        hidden = _sigmoid(lidar @ w1 + b1)
-    else:
-        hidden = _sigmoid(lidar[..., None] @ w1 + b1).sum(-2)
-    return _sigmoid(hidden @ theta[end:-1] + theta[-1])
+    if len(w1) == 1:
+        lidar = np.max(lidar, axis=-1, keepdims=True)
+    return _sigmoid(_sigmoid(lidar @ w1 + b1) @ theta[end:-1] + theta[-1])
 
 
 def _sigmoid(x: Array) -> Array:
