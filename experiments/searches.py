@@ -140,8 +140,9 @@ PLANS = {
         (
             Round("shortlist", 16, "reduced", (200, 201), 100, *DENSE),
             Round("validation", 4, "reduced_2m", FRESH, 200, *DENSE, paper.EVOLVED),
+            Round("nearest_shortlist", 4, "reduced_2m", (200, 201), 100, *NEAREST),
             Round(
-                *("nearest_validation", 2, "reduced_10m", FRESH, 200),
+                *("nearest_validation", 1, "reduced_10m", FRESH, 200),
                 *(*NEAREST, "ic4srl_nearest"),
             ),
         ),
