@@ -113,11 +113,10 @@ def guided(floor: float, *more: str, start: str = "monotone") -> tuple[str, ...]
     return (*first, "--return-floor", str(floor), *more)
 
 
-def nearest(floor: float) -> tuple[str, ...]:
-    """Flags of a longer stage of costs that see only how near the closest object is."""
-    size = ("--num-stages", "1", "--num-epochs", "256", "--fitness-epochs", "40")
-    more = ("--judge-by", "worst", "--network", "nearest", *size)
-    return guided(floor, *more, start="graded")
+def nearest(floor: float, *more: str) -> tuple[str, ...]:
+    """Flags of a search for costs that see only how near the closest object is."""
+    network = ("--network", "nearest", "--judge-by", "worst")
+    return guided(floor, *network, *more, start="graded")
 
 
 FRESH = (100, 101, 102, 103, 104)
@@ -128,6 +127,7 @@ SMALL += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
 SMALL += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
 LARGE = ("--preset", "search", "--physics", "closed_form", "--num-stages", "3")
 LARGE += ("--num-epochs", "96", "--chunk-epochs", "8", "--eval-episodes", "1000")
+LONGER = ("--num-stages", "1", "--num-epochs", "256", "--fitness-epochs", "40")
 PLANS = {
     "reduced": Plan(
         SMALL,
@@ -135,7 +135,7 @@ PLANS = {
             "guided": (guided(2.0, "--keep-level"), (0, 1, 2)),
             "paper": ((), (0, 1, 2)),
             "raw": (guided(2.0), (0,)),
-            "nearest": (nearest(2.0), (0,)),
+            "nearest": (nearest(2.0, *LONGER), (0,)),
         },
         (
             Round("shortlist", 16, "reduced", (200, 201), 100, *DENSE),
@@ -146,7 +146,8 @@ PLANS = {
                 *(*NEAREST, "ic4srl_nearest"),
             ),
         ),
-        "12 candidates, 512,000 steps a slot; 80 episodes a dot and algorithm",
+        "12 candidates; 512,000 steps a slot, 80 episodes a dot and algorithm "
+        "(nearest: 2,048,000 and 320)",
     ),
     "reduced_10m": Plan(
         LARGE,
@@ -161,7 +162,9 @@ PLANS = {
     ),
 }
 SMOKE = ("--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "2")
-PLANS["smoke"] = PLANS["reduced"]._replace(size=SMOKE)
+PLANS["smoke"] = PLANS["reduced"]._replace(
+    size=SMOKE, rules=PLANS["reduced"].rules | {"nearest": (nearest(2.0), (0,))}
+)
 
 
 def folder(runs: Path, rule: str, seed: int) -> Path:
