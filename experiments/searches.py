@@ -121,7 +121,7 @@ def nearest(floor: float, *more: str) -> tuple[str, ...]:
 
 FRESH = (100, 101, 102, 103, 104)
 DENSE = (("guided", "paper", "raw"), "mean", 2.0)  # who enters a round, how ranked
-NEAREST = (("nearest",), "worst", 2.0)
+NEAREST = (("nearest",), "worst", 1.0)
 SMALL = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "12")
 SMALL += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
 SMALL += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
