@@ -239,14 +239,18 @@ def guided_order(
 
 
 def validate(args: argparse.Namespace) -> None:
-    """All rounds, one after the other."""
+    """All rounds that have entrants, one after the other."""
     plan = PLANS[args.scale]
     for index, part in enumerate(plan.rounds):
+        rows = entrants(args.runs, plan, index)
+        if not rows:
+            print(f"{part.name}: no finished search by {' or '.join(part.rules)}")
+            continue
         scale = paper.scales()["smoke" if args.smoke else part.scale]
         config = paper.table(paper.TRAINING_WORLD, ["extrinsic"], scale)
         methods = tuple(
             Method(f"{i}-{algorithm}", algorithm, paper.WITH_NETWORK, 0.0, theta)
-            for i, row in enumerate(entrants(args.runs, plan, index))
+            for i, row in enumerate(rows)
             for algorithm in paper.BOTH
             for theta in [tuple(row["theta"].tolist())]
         )
@@ -256,11 +260,18 @@ def validate(args: argparse.Namespace) -> None:
         run_if_needed(config, args.runs / part.name, episodes)
 
 
+def was_run(runs: Path, part: Round) -> bool:
+    """Whether a round is finished."""
+    return (runs / part.name / "evaluation.json").exists()
+
+
 def entrants(runs: Path, plan: Plan, index: int) -> list[dict[str, Any]]:
     """Who takes part in a round: the best of the round before, or of the searches."""
-    part = plan.rounds[index]
-    follows = index > 0 and plan.rounds[index - 1].rules == part.rules
-    ranked = scored(runs, plan, index - 1) if follows else candidates(runs, plan, part)
+    part, before = plan.rounds[index], plan.rounds[index - 1]
+    if index == 0 or before.rules != part.rules:
+        ranked = candidates(runs, plan, part)
+    else:
+        ranked = scored(runs, plan, index - 1) if was_run(runs, before) else []
     return ranked[: part.entrants]
 
 
@@ -312,11 +323,6 @@ def ship(args: argparse.Namespace) -> None:
                 SHIPPED.mkdir(exist_ok=True)
                 save_cost(SHIPPED / name, row["theta"], to_json(card))
             print(name, card["found"], json.dumps(card["validation"]))
-
-
-def was_run(runs: Path, part: Round) -> bool:
-    """Whether a round is finished."""
-    return (runs / part.name / "evaluation.json").exists()
 
 
 def make_card(row: dict[str, Any], part: Round, config: SearchConfig) -> dict[str, Any]:

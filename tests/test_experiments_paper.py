@@ -292,6 +292,15 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     assert (tmp_path / "evolution.png").exists()
 
 
+def test_rounds_wait_for_their_searches(tmp_path, capsys):
+    args = argparse.Namespace(runs=tmp_path, smoke=True, scale="smoke")
+    searches.validate(args)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(PLAN.rounds)
+    assert lines[0] == "shortlist: no finished search by guided or paper or raw"
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_worse_of_two_agents_can_decide(tmp_path):
     """The best by the mean has an agent that flees, another a costly one."""
     runs = tmp_path / "runs"
