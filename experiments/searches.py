@@ -142,9 +142,10 @@ PLANS = {
             Round("validation", 4, "reduced_2m", FRESH, 200, *DENSE, paper.EVOLVED),
             Round("nearest_shortlist", 4, "reduced_2m", (200, 201), 100, *NEAREST),
             Round(
-                *("nearest_validation", 1, "reduced_10m", FRESH, 200),
+                *("nearest_validation", 1, "reduced_2m", FRESH, 200),
                 *(*NEAREST, "ic4srl_nearest"),
             ),
+            Round("nearest_10m", 1, "reduced_10m", FRESH, 200, *NEAREST),
         ),
         "12 candidates; 512,000 steps a slot, 80 episodes a dot and algorithm "
         "(nearest: 2,048,000 and 320)",
