@@ -115,7 +115,7 @@ def test_a_crash_ends_the_others_and_one_process_can_go_on(environment, tmp_path
     second.send_signal(signal.SIGKILL)
     second.communicate()
     said, _ = first.communicate(timeout=60)
-    assert first.returncode == 1, said
+    assert first.returncode in (1, 2), said  # by the kind of error JAX makes of it
     assert said.splitlines()[-1].startswith("python -m autocost_jax.evolve: ")
     flags = ("--resume", "--devices", "1", "--eval-episodes", "4")
     resumed = start(out, environment, *flags)
