@@ -109,6 +109,14 @@ def wait_for_all() -> None:
         multihost_utils.sync_global_devices("autocost_jax")
 
 
+def is_lost_peer(error: Exception) -> bool:
+    """Whether an error says that another process is gone.
+
+    JAX raises it as a RuntimeError or a ValueError, by where it notices.
+    """
+    return "Gloo" in str(error)
+
+
 def leave(status: int) -> None:
     """End a process of several at once, without waiting for the others.
 

@@ -84,11 +84,12 @@ def guarded(main: Callable[[], None], prog: str) -> None:
     Bad input is status 2, a run that could not go on is 1, Ctrl-C is 130.
     """
     from autocost_jax.arrays import DiskFullError
+    from autocost_jax.cluster import is_lost_peer
 
     try:
         main()
     except ValueError as error:
-        fail(f"{prog}: {error}")
+        fail(f"{prog}: {error}", status=1 if is_lost_peer(error) else BAD_INPUT)
     except OSError as error:
         fail(f"{prog}: {error.strerror or error}: {error.filename or ''}")
     except (DiskFullError, RuntimeError) as error:
