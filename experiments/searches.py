@@ -55,6 +55,7 @@ JUDGES: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     "mean": (np.mean, np.mean),
     "worst": (np.max, np.min),
 }
+NEAR = "ic4srl_nearest"
 SHIPPED = Path("src/autocost_jax/found")
 DISTANCES = (0.0, 0.3, 0.45, 0.6, 0.75, 0.9, 4.0)  # metres
 LOUDNESS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # a step, within 1.5 R of a hazard
@@ -119,9 +120,11 @@ def nearest(floor: float, *more: str) -> tuple[str, ...]:
     return guided(floor, *network, *more, start="graded")
 
 
-FRESH = (100, 101, 102, 103, 104)
+FRESH = ((100, 101, 102, 103, 104), 200)  # seeds of a round, and episodes
+BRIEF = ((200, 201), 100)
 DENSE = (("guided", "paper", "raw"), "mean", 2.0)  # who enters a round, how ranked
 NEAREST = (("nearest",), "worst", 1.0)
+GUIDED = (("guided",), "worst", 2.5)
 SMALL = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "12")
 SMALL += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
 SMALL += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1000")
@@ -138,14 +141,11 @@ PLANS = {
             "nearest": (nearest(2.0, *LONGER), (0,)),
         },
         (
-            Round("shortlist", 16, "reduced", (200, 201), 100, *DENSE),
-            Round("validation", 4, "reduced_2m", FRESH, 200, *DENSE, paper.EVOLVED),
-            Round("nearest_shortlist", 4, "reduced_2m", (200, 201), 100, *NEAREST),
-            Round(
-                *("nearest_validation", 1, "reduced_2m", FRESH, 200),
-                *(*NEAREST, "ic4srl_nearest"),
-            ),
-            Round("nearest_10m", 1, "reduced_10m", FRESH, 200, *NEAREST),
+            Round("shortlist", 16, "reduced", *BRIEF, *DENSE),
+            Round("validation", 4, "reduced_2m", *FRESH, *DENSE, paper.EVOLVED),
+            Round("nearest_shortlist", 4, "reduced_2m", *BRIEF, *NEAREST),
+            Round("nearest_validation", 1, "reduced_2m", *FRESH, *NEAREST, NEAR),
+            Round("nearest_10m", 1, "reduced_10m", *FRESH, *NEAREST),
         ),
         "12 candidates; 512,000 steps a slot, 80 episodes a dot and algorithm "
         "(nearest: 2,048,000 and 320)",
@@ -153,12 +153,7 @@ PLANS = {
     "reduced_10m": Plan(
         LARGE,
         {"guided": (guided(4.0, "--keep-level"), (0,))},
-        (
-            Round(
-                *("validation", 9, "reduced_10m", FRESH, 200),
-                *(("guided",), "worst", 2.5, "ic4srl"),
-            ),
-        ),
+        (Round("validation", 9, "reduced_10m", *FRESH, *GUIDED, "ic4srl"),),
         "50 candidates, 2,880,000 steps a slot; 300 episodes a dot and algorithm",
     ),
 }

@@ -35,24 +35,16 @@ def render(result: dict[str, Any]) -> str:
             f"| {', '.join(f'{min(c):.2f}' if c else '-' for c in useful)} |"
         )
     for rules, rows in result["loudness"].items():
-        lines += [
-            "",
-            f"| {rules}: cost of a step near a hazard "
-            "| trained | mean cost | mean return |",
-            "|---|---|---|---|",
-        ]
+        near = f"{rules}: cost of a step near a hazard"
+        lines += heads(near, "trained", "mean cost", "mean return")
         for row in rows:
             lines.append(
                 f"| {row['low']} to {row['high']} | {row['count']} | {row['cost']:.1f} "
                 f"| {row['return']:.1f} |"
             )
     for name, rows in result["distance"].items():
-        lines += [
-            "",
-            f"| distance to the closest hazard | {name}: cost of a step "
-            "| 10 % to 90 % |",
-            "|---|---|---|",
-        ]
+        step = f"{name}: cost of a step"
+        lines += heads("distance to the closest hazard", step, "10 % to 90 %")
         for row in rows:
             lines.append(
                 f"| {row['low']:g} to {row['high']:g} m | {row['mean']:.4f} "
@@ -61,6 +53,11 @@ def render(result: dict[str, Any]) -> str:
     for name in result["rounds"]:
         lines += ["", *render_round(name.replace("_", " "), name, result[name])]
     return "\n".join(lines) + "\n"
+
+
+def heads(*columns: str) -> list[str]:
+    """The first lines of a table, after an empty one."""
+    return ["", f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
 
 
 def render_round(title: str, name: str, rows: list[dict[str, Any]]) -> list[str]:

@@ -8,6 +8,7 @@ Array = np.ndarray[Any, Any]
 
 LIDAR_BINS = 8
 HIDDEN = 4
+THETA_SIZES = tuple(rows * HIDDEN + HIDDEN + HIDDEN + 1 for rows in (LIDAR_BINS, 1))
 
 
 def object_lidar(ego_xy: Array) -> Array:

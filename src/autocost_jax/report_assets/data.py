@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from autocost_jax.report_assets.cost_field import Array
+from autocost_jax.report_assets.cost_field import THETA_SIZES, Array
 from autocost_jax.report_assets.replay import Replay
 
 TIMID_DISTANCE = 1.0  # metres an episode; an agent below it hardly moves
@@ -186,7 +186,10 @@ def _check_stage(stage: StageRecord, algorithms: int, name: str) -> None:
     size = np.shape(stage.cost)[0] if np.ndim(stage.cost) == 1 else -1
     if size < 1:
         raise ValueError(f"{name}.cost must be [P], got shape {np.shape(stage.cost)}")
-    _shape(stage.theta, (size, *np.shape(stage.theta)[-1:]), f"{name}.theta")
+    width = np.shape(stage.theta)[-1]
+    if width not in THETA_SIZES:
+        raise ValueError(f"{name}.theta must have {THETA_SIZES} columns, got {width}")
+    _shape(stage.theta, (size, width), f"{name}.theta")
     for key in ("ep_return", "zero_violation", "far_cost", "near_cost"):
         _shape(getattr(stage, key), (size,), f"{name}.{key}")
     for key in ("algorithm_cost", "algorithm_return", "distance_travelled"):
