@@ -87,6 +87,14 @@ def with_physics(config: SearchConfig, physics: Any) -> SearchConfig:
     return dataclasses.replace(config, train=train)
 
 
+def with_chunks(config: SearchConfig, epochs: int | None) -> SearchConfig:
+    """The same search with other chunks, None: with its own."""
+    if epochs is None:
+        return config
+    train = dataclasses.replace(config.train, chunk_epochs=epochs)
+    return dataclasses.replace(config, train=train)
+
+
 def with_precision(train: TrainConfig, precision: Precision) -> TrainConfig:
     """The same training with critics of another precision."""
     agent = dataclasses.replace(train.agent, critic_precision=precision)
@@ -103,10 +111,11 @@ def main() -> None:
         "--precisions", nargs="+", choices=get_args(Precision), default=["float32"]
     )
     parser.add_argument("--update-slots", type=int, help="default: one a device")
+    parser.add_argument("--chunk-epochs", type=int, help="in a call; default: preset's")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder")
     options = parser.parse_args()
     devices = use_devices(options.devices)
-    config = preset(options.preset)
+    config = with_chunks(preset(options.preset), options.chunk_epochs)
     fast = with_physics(config, "closed_form")
     measure: dict[str, Callable[[], list[Any]]] = {
         "mjx": lambda: search_speeds(config, devices),

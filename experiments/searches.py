@@ -55,7 +55,7 @@ JUDGES: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     "mean": (np.mean, np.mean),
     "worst": (np.max, np.min),
 }
-NEAR = "ic4srl_nearest"
+BEST, NEAR = "ic4srl", "ic4srl_nearest"
 SHIPPED = Path("src/autocost_jax/found")
 DISTANCES = (0.0, 0.3, 0.45, 0.6, 0.75, 0.9, 4.0)  # metres
 LOUDNESS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # a step, within 1.5 R of a hazard
@@ -124,6 +124,7 @@ FRESH = ((100, 101, 102, 103, 104), 200)  # seeds of a round, and episodes
 BRIEF = ((200, 201), 100)
 DENSE = (("guided", "paper", "raw"), "mean", 2.0)  # who enters a round, how ranked
 NEAREST = (("nearest",), "worst", 1.0)
+NEAREST_10M = (("nearest",), "worst", 1.5)
 GUIDED = (("guided",), "worst", 2.5)
 SMALL = ("--preset", "laptop", "--physics", "closed_form", "--population-size", "12")
 SMALL += ("--num-elites", "3", "--num-stages", "4", "--num-epochs", "64")
@@ -131,6 +132,9 @@ SMALL += ("--chunk-epochs", "4", "--fitness-epochs", "10", "--eval-episodes", "1
 LARGE = ("--preset", "search", "--physics", "closed_form", "--num-stages", "3")
 LARGE += ("--num-epochs", "96", "--chunk-epochs", "8", "--eval-episodes", "1000")
 LONGER = ("--num-stages", "1", "--num-epochs", "256", "--fitness-epochs", "40")
+LONGEST = ("--num-stages", "2", "--num-epochs", "259", "--chunk-epochs", "37")
+LONGEST += ("--fitness-epochs", "20", "--keep-level", "--mutation-std", "0.5")
+LONGEST += ("--mutation-low", "0.8", "--mutation-high", "1.25")
 PLANS = {
     "reduced": Plan(
         SMALL,
@@ -152,8 +156,14 @@ PLANS = {
     ),
     "reduced_10m": Plan(
         LARGE,
-        {"guided": (guided(4.0, "--keep-level"), (0,))},
-        (Round("validation", 9, "reduced_10m", *FRESH, *GUIDED, "ic4srl"),),
+        {
+            "guided": (guided(4.0, "--keep-level"), (0,)),
+            "nearest": (nearest(1.5, *LONGEST), (0,)),
+        },
+        (
+            Round("validation", 9, "reduced_10m", *FRESH, *GUIDED, "ic4srl_dense"),
+            Round("nearest_validation", 10, "reduced_10m", *FRESH, *NEAREST_10M, BEST),
+        ),
         "50 candidates, 2,880,000 steps a slot; 300 episodes a dot and algorithm",
     ),
 }
@@ -312,7 +322,7 @@ def ship(args: argparse.Namespace) -> None:
             continue
         for place, row in enumerate(scored(args.runs, plan, index)[:4]):
             config, facts = read_config(folder(args.runs, row["rule"], row["seed"]))
-            name = f"runner_up_{place}" if place else part.winner
+            name = f"{part.winner}_runner_up_{place}" if place else part.winner
             card = make_card(row, part, config) | {"commit": facts["commit"]}
             save_cost(where / name, row["theta"], to_json(card))
             if place == 0 and not args.smoke:

@@ -26,6 +26,7 @@ from autocost_jax.population import (
     Population,
     make_agents,
     make_population,
+    remake_empty,
     stack_slots,
 )
 from autocost_jax.records import EnvState, Slot
@@ -374,7 +375,7 @@ def _random_steps(
     env: Env, num_steps: int, inputs: tuple[EnvState, jax.Array]
 ) -> tuple[EnvState, jax.Array]:
     """Uniform actions in a batch of worlds; the keys [1] are returned advanced."""
-    worlds, keys = inputs
+    worlds, keys = remake_empty(inputs)
     shape = (worlds.reward.shape[0], env.action_size)
 
     def step(worlds: EnvState, t: jax.Array) -> tuple[EnvState, None]:

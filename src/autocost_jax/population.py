@@ -203,6 +203,7 @@ def _chunk_fn(
         def body(learners: tuple[Learner, ...], epoch: jax.Array):
             return run_epoch(env, agents, config, learners, slots, epoch, bank)
 
+        learners = remake_empty(learners)
         epochs = epoch + jnp.arange(config.chunk_epochs, dtype=jnp.int32)
         return jax.lax.scan(body, learners, epochs)
 
@@ -214,6 +215,15 @@ def _chunk_fn(
         check_vma=False,
     )
     return jax.jit(sharded, donate_argnums=0)
+
+
+def remake_empty(tree: Any) -> Any:
+    """The same tree with new arrays for those without elements, such as no pillars.
+
+    jaxlib 0.11 crashes when it compiles a program for several CPU devices that returns
+    an empty array it was given.
+    """
+    return jax.tree.map(lambda x: x if x.size else jnp.zeros_like(x), tree)
 
 
 def _sharded(fn: Callable, mesh: Mesh, spec: P) -> Callable:
