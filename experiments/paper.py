@@ -60,6 +60,7 @@ COSTS = RESULTS / "reduced" / "costs"
 WITH_NETWORK = "extrinsic+intrinsic"
 EVOLVED = "ic4srl_reduced"
 FOUND = "found"
+SEEDS = (0, 1, 2, 3, 4)
 DESIGNS: dict[str, Design] = {
     "unconstrained": Design("", algorithms=("ppo",)),
     "extrinsic": Design("limit 0"),
@@ -90,7 +91,7 @@ class Scale(NamedTuple):
     """
 
     train: TrainConfig
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    seeds: tuple[int, ...] = SEEDS
     episodes: int = 200
     sizes: dict[str, tuple[int, int, int]] = {}  # noqa: RUF012
     evolved: str = EVOLVED
@@ -100,7 +101,8 @@ def scales() -> dict[str, Scale]:
     """`reduced`: the laptop's update and 512,000 steps a slot, fewer in slow worlds.
 
     `reduced_2m` is four times as long. `reduced_10m` is the `search` preset's learner
-    with the paper's 333 epochs of 30 worlds, 9,990,000 steps a slot.
+    with the paper's 333 epochs of 30 worlds, 9,990,000 steps a slot; `reduced_8m` stops
+    after 259 of them.
     """
     laptop, smoke = preset("laptop").train, preset("smoke").train
     search = preset("search").train
@@ -118,6 +120,7 @@ def scales() -> dict[str, Scale]:
     return {
         "reduced": Scale(reduced, sizes=slow),
         "reduced_2m": Scale(longer, sizes=slow_2m),
+        "reduced_8m": Scale(dataclasses.replace(longest, num_epochs=259)),
         "reduced_10m": Scale(longest, evolved="ic4srl"),
         "paper": Scale(preset("paper").train, evolved="ic4srl"),
         "smoke": Scale(smoke, seeds=(0, 1), episodes=2),
@@ -185,14 +188,26 @@ def steps_a_slot(train: TrainConfig) -> int:
 
 
 def run(figure: Figure, scale: Scale, runs: Path) -> None:
-    """Train what the figure lacks, all of it side by side in each world."""
+    """Train what the figure lacks, side by side in each world and size of network."""
     for world in figure.worlds:
         wanted = distinct(figure.designs, scale)
-        designs = [d for d in wanted if find(runs, world, d, scale) is None]
-        if designs:
+        missing = [d for d in wanted if find(runs, world, d, scale) is None]
+        for designs in by_network(missing, scale):
             config = table(world, designs, scale)
             episodes = world_size(world, scale)[2]
             run_if_needed(config, runs / world / "+".join(designs), episodes)
+
+
+def by_network(designs: Sequence[str], scale: Scale) -> list[list[str]]:
+    """Designs whose networks fit in one table; those without one go with the first."""
+    groups: dict[int, list[str]] = {}
+    without = []
+    for design in designs:
+        theta = methods(design, scale)[0].theta
+        own = without if theta is None else groups.setdefault(len(theta), [])
+        own.append(design)
+    first, *others = groups.values() or [[]]
+    return [group for group in ([*without, *first], *others) if group]
 
 
 def distinct(designs: Sequence[str], scale: Scale) -> list[str]:
@@ -219,9 +234,13 @@ class Trained(NamedTuple):
 
 
 def find(runs: Path, world: str, design: str, scale: Scale) -> Trained | None:
-    """The finished run that holds a design, whatever else was trained in it."""
+    """The finished run that holds a design, whatever else was trained in it.
+
+    It may be a round of `searches.py`.
+    """
     wanted = table(world, [design], scale)
-    for file in sorted((runs / world).glob("*/evaluation.json")):
+    files = [*(runs / world).glob("*/evaluation.json"), *runs.glob("*/evaluation.json")]
+    for file in sorted(files):
         config = read_config(file.parent, TableConfig)[0]
         labels = {content(method): method.label for method in config.methods}
         same = (config.train, config.seeds) == (wanted.train, wanted.seeds)

@@ -122,6 +122,7 @@ def nearest(floor: float, *more: str) -> tuple[str, ...]:
 
 FRESH = ((100, 101, 102, 103, 104), 200)  # seeds of a round, and episodes
 BRIEF = ((200, 201), 100)
+OTHERS = (paper.SEEDS, 200)  # the figures', for what was chosen on fresh ones
 DENSE = (("guided", "paper", "raw"), "mean", 2.0)  # who enters a round, how ranked
 NEAREST = (("nearest",), "worst", 1.0)
 NEAREST_10M = (("nearest",), "worst", 1.5)
@@ -162,7 +163,8 @@ PLANS = {
         },
         (
             Round("validation", 9, "reduced_10m", *FRESH, *GUIDED, "ic4srl_dense"),
-            Round("nearest_validation", 10, "reduced_10m", *FRESH, *NEAREST_10M, BEST),
+            Round("nearest_shortlist", 10, "reduced_8m", *FRESH, *NEAREST_10M),
+            Round("nearest_validation", 1, "reduced_10m", *OTHERS, *NEAREST_10M, BEST),
         ),
         "50 candidates, 2,880,000 steps a slot; 300 episodes a dot and algorithm",
     ),
