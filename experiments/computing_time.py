@@ -4,6 +4,7 @@
     python benchmarks/population.py --preset paper --parts update
     python experiments/computing_time.py
 
+The evolution on a GPU is that of `benchmarks/gpu_session.sh`, as far as it has run.
 Nothing is trained: hours are the paper's 10,000,000 steps and 333 updates, at its own
 hyper-parameters and at the measured rates of a machine that is full. The paper had 64
 hardware threads and two GPUs, and does not say whether its hours are of one agent or
@@ -90,6 +91,19 @@ def collect(benchmarks: Path) -> dict[str, Any]:
         "hours": worlds,
         "paper_evolution_hours": PAPER_EVOLUTION,
         "evolution_hours": agents * sum(fast[name] for name in updates),
+        "gpu": on_a_gpu(benchmarks / "gpu" / "population_paper.json"),
+    }
+
+
+def on_a_gpu(file: Path) -> dict[str, Any] | None:
+    """The whole evolution at the rate of its own program, if that was measured."""
+    if not file.exists():
+        return None
+    part = json.loads(file.read_text())["parts"]["closed_form"]
+    return {
+        "device": part["facts"]["device"],
+        "command": part["command"],
+        "evolution_hours": part["search_hours"],
     }
 
 
@@ -110,6 +124,12 @@ def render(result: dict[str, Any]) -> str:
         f"| evolution, 700 agents | {result['paper_evolution_hours']} | "
         f"{result['evolution_hours']:.0f} for both | | |"
     )
+    if result["gpu"]:
+        lines.append(
+            f"| the same on an {result['gpu']['device']} "
+            f"| {result['paper_evolution_hours']} "
+            f"| {result['gpu']['evolution_hours']:.1f} for both | | |"
+        )
     return "\n".join(lines) + "\n"
 
 

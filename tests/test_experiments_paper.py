@@ -7,12 +7,15 @@ import re
 import subprocess
 import sys
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from autocost_jax import cost_card, load_cost, preset
+from autocost_jax.costs import total_cost
 from autocost_jax.env_config import ENVS
 from autocost_jax.methods import Method, TableConfig
+from autocost_jax.records import CostInputs
 from autocost_jax.store import RunDir
 from scripts import ROOT, load_script
 
@@ -32,6 +35,7 @@ computing_time = load_script("experiments/computing_time")
 paper = load_script("experiments/paper")
 searches = load_script("experiments/searches")
 searches_tables = load_script("experiments/searches_tables")
+shapes = load_script("experiments/shapes")
 transfer = load_script("experiments/transfer")
 PLAN = searches.PLANS["smoke"]
 
@@ -103,7 +107,11 @@ def test_the_tables_of_the_readme_are_those_of_the_results():
     for name, shown in blocks:
         file = ROOT / "experiments" / "results" / f"{name}.json"
         result = json.loads(file.read_text())
-        render = {"evolution": searches_tables.render, "transfer": transfer.render}
+        render = {
+            "evolution": searches_tables.render,
+            "shapes": shapes.render,
+            "transfer": transfer.render,
+        }
         expect = render.get(file.stem, paper.render)(result)
         assert shown.strip() == expect.strip(), name
 
@@ -134,6 +142,13 @@ def test_computing_times_are_steps_over_rate_and_updates(tmp_path):
     agents = 50 * 7 * (hours["ppo_lagrangian"] + hours["cpo"])
     assert result["evolution_hours"] == pytest.approx(agents)
     assert result["hours"]["Goal-Hazard-Doggo"]["cpo"] > hours["cpo"]  # more readings
+    assert result["gpu"] is None
+    closed = {"facts": {"device": "H"}, "command": "c", "search_hours": 4.8}
+    (tmp_path / "gpu").mkdir()
+    file = tmp_path / "gpu" / "population_paper.json"
+    file.write_text(json.dumps({"parts": {"closed_form": closed}}))
+    table = computing_time.render(computing_time.collect(tmp_path))
+    assert "| the same on an H | 54.1 | 4.8 for both | | |" in table
     steps[0]["facts"] = {"device": "gpu"}
     (tmp_path / "env_steps.json").write_text(json.dumps({"rows": steps}))
     with pytest.raises(SystemExit, match="different devices"):
@@ -279,7 +294,8 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     card = cost_card(tmp_path / "costs" / "ic4srl_reduced")
     assert card["fails"] == "not free of violations under PPO-Lag"
     assert card["validation"]["cpo"]["violation_rate_upper"] > 0
-    assert len(list((tmp_path / "costs").glob("runner_up_*.npz"))) == 3
+    others = (tmp_path / "costs").glob("ic4srl_reduced_runner_up_*.npz")
+    assert len(list(others)) == 3
     searches.collect(args)
     table = (tmp_path / "evolution.md").read_text()
     assert "| guided, 0 | 2.62, 4.50 | 0.00, 3.00 |" in table
@@ -338,6 +354,72 @@ def test_a_design_is_found_in_whatever_table_it_was_trained(tmp_path):
     assert paper.find(tmp_path, world, "unconstrained", scale) is not None
     assert paper.find(tmp_path, world, "limit_-1", scale) is None
     assert paper.find(tmp_path, world, "steep", paper.scales()["reduced"]) is None
+
+
+def test_a_round_of_the_searches_counts_as_trained(tmp_path):
+    scale, world = paper.scales()["smoke"], "Goal-Hazard-Point"
+    config = paper.table(world, ["evolved"], scale)
+    with RunDir.create(tmp_path / "a_round", config) as run:
+        run.write_json("evaluation", {"episodes": 2, "rows": []})
+    found = paper.find(tmp_path, world, "evolved", scale)
+    assert found is not None
+    assert found.path == tmp_path / "a_round"
+    assert paper.find(tmp_path, "Goal-Pillar-Point", "evolved", scale) is None
+
+
+def test_a_table_holds_networks_of_one_size():
+    """Costs without a network go with the first."""
+    scale = paper.scales()["smoke"]._replace(evolved="ic4srl_nearest")
+    groups = paper.by_network(["evolved", "extrinsic", "steep", "margin_2x"], scale)
+    assert groups == [["extrinsic", "margin_2x", "evolved"], ["steep"]]
+    for group in groups:
+        paper.table("Goal-Hazard-Point", group, scale)
+    assert paper.by_network(["extrinsic"], scale) == [["extrinsic"]]
+    assert paper.by_network([], scale) == []
+
+
+def test_a_shape_costs_what_its_name_says():
+    inputs = CostInputs(
+        cost=jnp.array([0.1, 0.0, 0.0]),
+        constraint_lidar=jnp.zeros((3, 8)),
+        distance=jnp.array([0.2, 0.5, 0.7]),
+        previous_distance=jnp.zeros(3),
+        radius=jnp.full(3, 0.3),
+    )
+    expect = {
+        shapes.Shape("hinge", 2.0): [0.1 + 0.4, 0.1, 0.0],
+        shapes.Shape("hinge", 2.0, 0.1, constant=1e-3): [0.141, 0.011, 0.001],
+        shapes.Shape("step", 2.0, 0.5): [0.6, 0.5, 0.0],
+        shapes.Shape("bowl", 2.0): [0.1 + 0.16 / 0.6, 0.01 / 0.6, 0.0],
+    }
+    for shape, cost in expect.items():
+        slot = shapes.slot(shape._replace(limit=2.0), seed=0)
+        assert slot.cost.limit == 2.0
+        total = total_cost(slot.cost, inputs, shapes.SHAPES)
+        np.testing.assert_allclose(total, cost, rtol=1e-5)
+    assert len(set(shapes.TRIED)) == len(shapes.TRIED) == 29
+
+
+def test_shapes_from_training_to_picture(tmp_path):
+    """In two goes; what is trained is not trained again."""
+    words = ["--smoke", "--runs", str(tmp_path / "runs"), "--results", str(tmp_path)]
+    for part in ("run", "run", "collect"):
+        subprocess.run(
+            [sys.executable, "experiments/shapes.py", part, *words],
+            check=True,
+            cwd=ROOT,
+        )
+    result = json.loads((tmp_path / "shapes.json").read_text())
+    assert [row["shape"] for row in result["shapes"]] == [
+        shape._asdict() for shape in shapes.TRIED[:2]
+    ]
+    assert result["episodes"] == 2 * 2 * 2
+    for row in result["shapes"]:
+        for algorithm in paper.BOTH:
+            assert set(row[algorithm]) == set(shapes.SCORES)
+            assert all(len(values) == 2 for values in row[algorithm].values())
+    assert "| hinge 1.25x |" in (tmp_path / "shapes.md").read_text()
+    assert (tmp_path / "shapes.png").stat().st_size > 10_000
 
 
 def test_one_figure_from_training_to_picture(tmp_path):

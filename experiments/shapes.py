@@ -1,0 +1,267 @@
+"""How far any cost of the distance gets: hand-made shapes, heights and limits.
+
+    python experiments/shapes.py run --scale reduced_10m   # 3 minutes on an H200
+    python experiments/shapes.py collect --scale reduced_10m
+
+A shape is a cost of the distance D to the closest object, silent beyond a multiple m of
+its radius R and added to the extrinsic cost:
+
+    hinge  h max(0, m R - D)        step  h [D < m R]
+    bowl   h max(0, m R - D)^2 / (m R)
+
+with a constant on top for some, and a limit. Both algorithms, two seeds; scores are
+those of the training episodes of the last 20 epochs. Shapes are no entries of the
+package's bank: this is also an example of a bank of one's own. `--at-once 2` trains two
+shapes at a time, for a CPU; what has been trained is not trained again.
+"""
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import paper
+
+from autocost_jax import CostTerm, Slot, TrainingCost, make_env, make_population
+from autocost_jax.config import THETA_SIZES
+from autocost_jax.costs import BANK
+from autocost_jax.population import make_agents, stack_slots
+from autocost_jax.records import CostInputs
+from autocost_jax.rundata import to_json
+from autocost_jax.store import run_facts
+
+SEEDS, LAST = (0, 1), 20
+SCORES = {
+    "return": "ep_return",
+    "cost": "ep_cost",
+    "training_cost": "ep_total_cost",
+    "violating": "violating_worlds",
+}
+
+
+class Shape(NamedTuple):
+    """A cost of the distance.
+
+    Attributes:
+      kind: hinge, step or bowl.
+      multiple: m, radii from the centre of an object to where it falls silent.
+      height: h, a metre (hinge and bowl) or a step (step).
+      constant: added everywhere.
+      limit: allowed training cost of an episode.
+    """
+
+    kind: str
+    multiple: float
+    height: float = 1.0
+    constant: float = 0.0
+    limit: float = 0.0
+
+    @property
+    def title(self) -> str:
+        """As in the table."""
+        parts = [f"{self.kind} {self.multiple:g}x"]
+        parts += [f"height {self.height:g}"] if self.height != 1 else []
+        parts += [f"plus {self.constant:g}"] if self.constant else []
+        parts += [f"limit {self.limit:g}"] if self.limit else []
+        return ", ".join(parts)
+
+
+def _gap(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+    """How far inside, metres; the multiple is the first entry of theta."""
+    return jnp.maximum(theta[0] * inputs.radius - inputs.distance, 0.0)
+
+
+def _step(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+    return (_gap(inputs, theta) > 0).astype(inputs.distance.dtype)
+
+
+def _bowl(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+    return _gap(inputs, theta) ** 2 / (theta[0] * inputs.radius)
+
+
+def _constant(inputs: CostInputs, theta: jax.Array) -> jax.Array:
+    del theta
+    return jnp.ones_like(inputs.distance)
+
+
+SHAPES = (
+    BANK[0],  # the extrinsic cost
+    CostTerm("hinge", _gap),
+    CostTerm("step", _step),
+    CostTerm("bowl", _bowl),
+    CostTerm("constant", _constant),
+)
+LIMITS = ((1.5, 0.5), (1.5, 2.0), (2.0, 0.5), (2.0, 2.0), (2.0, 8.0), (2.5, 2.0))
+STEPS = ((1.25, 0.1), (1.5, 0.1), (1.75, 0.1), (2.0, 0.1), (1.5, 0.01), (2.0, 0.01))
+TRIED = (
+    *(Shape("hinge", m) for m in (1.25, 1.5, 1.75, 2.0, 2.25, 2.5)),
+    *(Shape("hinge", m, 0.1) for m in (1.5, 2.0, 2.5)),
+    *(Shape("hinge", m, limit=limit) for m, limit in (*LIMITS, (2.5, 8.0))),
+    *(Shape("step", m, height) for m, height in STEPS),
+    *(Shape("bowl", m) for m in (2.0, 2.5, 3.0)),
+    *(Shape("hinge", 2.0, constant=constant) for constant in (1e-4, 1e-3)),
+    *(Shape("hinge", m, 10.0) for m in (2.0, 1.5)),
+)
+
+
+def slot(shape: Shape, seed: int) -> Slot:
+    """What trains one shape with one seed."""
+    weights = {"extrinsic": 1.0, shape.kind: shape.height, "constant": shape.constant}
+    theta = jnp.zeros(THETA_SIZES["nearest"]).at[0].set(shape.multiple)
+    row = jnp.asarray([weights.get(term.name, 0.0) for term in SHAPES])
+    cost = TrainingCost(weights=row, theta=theta, limit=jnp.asarray(shape.limit))
+    return Slot(cost, jax.random.key(seed), jnp.ones(()))
+
+
+def train(shapes: Sequence[Shape], scale: paper.Scale) -> Iterator[dict[str, Any]]:
+    """Train shapes side by side; a row of scores each, [seeds] for both algorithms."""
+    config = paper.table(paper.TRAINING_WORLD, ["extrinsic"], scale).train
+    env = make_env(config.env)
+    agents = make_agents(paper.BOTH, config, env)
+    group = stack_slots([slot(shape, seed) for shape in shapes for seed in SEEDS])
+    slots = tuple(group for _ in agents)
+    population = make_population(env, agents, config, SHAPES, jax.devices())
+    learners, history = population.init(slots), []
+    for epoch in range(0, config.num_epochs, config.chunk_epochs):
+        learners, metrics = population.chunk(learners, slots, epoch)
+        history.append(jax.tree.map(np.asarray, population.fetch(metrics)))
+        print(f"epoch {epoch + config.chunk_epochs} of {config.num_epochs}", flush=True)
+    whole = jax.tree.map(lambda *chunks: np.concatenate(chunks), *history)
+    for index, shape in enumerate(shapes):
+        own = slice(len(SEEDS) * index, len(SEEDS) * (index + 1))
+        yield {"shape": shape._asdict()} | {
+            algorithm: {
+                name: values[key][-LAST:, own].mean(0).round(5).tolist()
+                for name, key in SCORES.items()
+            }
+            for algorithm, values in zip(paper.BOTH, whole, strict=True)
+        }
+
+
+def trained(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """The rows of all shapes that have been trained."""
+    file = args.runs / "shapes.jsonl"
+    lines = file.read_text().splitlines() if file.exists() else ()
+    return [json.loads(line) for line in lines]
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train what is missing, some shapes at a time."""
+    scale, known = paper.scales()[args.scale], TRIED[:2] if args.smoke else TRIED
+    done = [Shape(**row["shape"]) for row in trained(args)]
+    missing = [shape for shape in known if shape not in done]
+    facts = run_facts()
+    facts.pop("seed")
+    args.runs.mkdir(parents=True, exist_ok=True)
+    for start in range(0, len(missing), args.at_once):
+        for row in train(missing[start : start + args.at_once], scale):
+            with (args.runs / "shapes.jsonl").open("a") as file:
+                file.write(json.dumps(to_json(row | {"facts": facts})) + "\n")
+
+
+def collect(args: argparse.Namespace) -> None:
+    """JSON, table and picture."""
+    rows = trained(args)
+    facts = {json.dumps(row.pop("facts"), sort_keys=True) for row in rows}
+    config = paper.scales()[args.scale].train
+    result = {
+        "title": "Shapes of a cost by hand",
+        "scale": args.scale,
+        "command": f"python experiments/shapes.py run --scale {args.scale}",
+        "steps_a_slot": paper.steps_a_slot(config),
+        "seeds": list(SEEDS),
+        "episodes": config.num_worlds * min(LAST, config.num_epochs) * len(SEEDS),
+        "trained": [json.loads(text) for text in sorted(facts)],
+        "shapes": rows,
+    }
+    file = paper.write(result, "shapes", args.results)
+    file.with_suffix(".md").write_text(render(result))
+    draw(result, file.with_suffix(".png"), args.results / "margins.json")
+    print(file)
+
+
+def caption(result: dict[str, Any]) -> str:
+    """How much the numbers rest on."""
+    return (
+        f"{result['scale']} scale: {result['steps_a_slot']:,} steps a slot, "
+        f"{len(result['seeds'])} seeds, the last {result['episodes']} training episodes"
+    )
+
+
+def render(result: dict[str, Any]) -> str:
+    """A row a shape."""
+    columns = ("return", "cost", "violating")
+    heads = [f"{paper.NAMES[a]}: {column}" for a in paper.BOTH for column in columns]
+    lines = [
+        f"Goal-Hazard-Point ({caption(result)})",
+        "",
+        f"| shape | {' | '.join(heads)} |",
+        "|---" * (1 + len(heads)) + "|",
+    ]
+    for row in result["shapes"]:
+        cells = [Shape(**row["shape"]).title]
+        for algorithm in paper.BOTH:
+            gain, cost, rate = (np.mean(row[algorithm][name]) for name in columns)
+            cells += [f"{gain:.1f}", f"{cost:.3f}", f"{rate:.1%}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def draw(result: dict[str, Any], file: Path, margins: Path) -> None:
+    """Violating episodes against return, and the evolved costs of `margins`."""
+    from matplotlib.figure import Figure as Picture
+
+    picture = Picture(figsize=(9.5, 4.2), layout="constrained")
+    panels = picture.subplots(1, 2, sharey=True)
+    for panel, algorithm in zip(panels, paper.BOTH, strict=True):
+        for index, kind in enumerate(("hinge", "step", "bowl")):
+            for flat in (True, False):  # a plain one, or with a limit or a constant
+                own = [
+                    row[algorithm]
+                    for row in result["shapes"]
+                    if row["shape"]["kind"] == kind
+                    and flat == (not row["shape"]["limit"] + row["shape"]["constant"])
+                ]
+                if own:
+                    panel.plot(
+                        [np.mean(row["return"]) for row in own],
+                        [100 * np.mean(row["violating"]) for row in own],
+                        "os^"[index],
+                        color=f"C{index}",
+                        fillstyle="full" if flat else "none",
+                        label=kind + ("" if flat else ", limit or constant"),
+                    )
+        if margins.exists():
+            world = json.loads(margins.read_text())["worlds"][paper.TRAINING_WORLD]
+            for index, design in enumerate(d for d in world if "evolved" in d):
+                score = world[design]["algorithms"][algorithm]
+                panel.plot(
+                    score["return"]["mean"],
+                    100 * score["violation_rate"],
+                    "*PX"[index % 3],
+                    color="k",
+                    markersize=9,
+                    label=paper.DESIGNS[design].title,
+                )
+        panel.set_title(paper.NAMES[algorithm], fontsize=9)
+        panel.set_xlabel("return an episode")
+        panel.set_yscale("symlog", linthresh=0.2)
+        panel.set_ylim(-0.02, 100)
+    panels[0].set_ylabel("violating episodes, %")
+    lines, names = panels[0].get_legend_handles_labels()
+    picture.legend(lines, names, fontsize=6, ncols=4, loc="outside lower center")
+    picture.suptitle(f"{result['title']}\n{caption(result)}", fontsize=8)
+    picture.savefig(file, dpi=130)
+
+
+PARTS = {"run": run, "collect": collect}
+
+if __name__ == "__main__":
+    flags = paper.parser(__doc__, PARTS, scales=("reduced", "reduced_10m"))
+    flags.add_argument("--at-once", type=int, default=len(TRIED), help="shapes")
+    options = paper.arguments(flags)
+    PARTS[options.part](options)
