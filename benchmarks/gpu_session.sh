@@ -25,7 +25,8 @@ part() {
 nvidia-smi >"$out/nvidia-smi.txt" 2>&1
 part env_steps 135 python benchmarks/env_steps.py --batch 1024 8192 65536 \
     --only "Goal-Hazard-Point, closed form" Goal-Hazard-Point --out "$out/env_steps.json"
-part paper 120 python benchmarks/population.py --preset paper --parts closed_form mjx --out "$out"
+part paper 150 python benchmarks/population.py --preset paper --parts closed_form --chunk-epochs 1 \
+    --out "$out"
 part update 100 python benchmarks/population.py --preset paper --parts update --update-slots 50 \
     --precisions float32 tensorfloat32 bfloat16 --out "$out"
 part search 95 python benchmarks/population.py --preset search --parts closed_form slots --out "$out"

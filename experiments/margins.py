@@ -20,6 +20,7 @@ FIGURE = Figure(
         "margin_3x",
         "steep",
         "evolved",
+        "evolved_dense",
         "evolved_reduced",
     ),
 )

@@ -26,13 +26,14 @@ from common import compact, run_if_needed
 
 from autocost_jax import TrainConfig, env_config, load_cost, preset
 from autocost_jax.commandline import use_compile_cache, use_devices
+from autocost_jax.config import Algorithm
 from autocost_jax.methods import Learners, Method, TableConfig
 from autocost_jax.rundata import to_json
 from autocost_jax.store import read_config, read_metrics, run_facts
 
 RESULTS = Path("experiments/results")
 TRAINING_WORLD = "Goal-Hazard-Point"
-BOTH: tuple[Learners, ...] = ("ppo_lagrangian", "cpo")
+BOTH: tuple[Algorithm, ...] = ("ppo_lagrangian", "cpo")
 NAMES = {"ppo": "PPO", "ppo_lagrangian": "PPO-Lag", "cpo": "CPO"}
 CURVES = ("ep_return", "ep_cost", "ep_total_cost")
 
@@ -75,6 +76,7 @@ DESIGNS: dict[str, Design] = {
     "steep": Design("steep network", WITH_NETWORK, theta=COSTS / "steep"),
     "evolved": Design("evolved", WITH_NETWORK, theta=FOUND),
     "evolved_alone": Design("evolved, w/o extrinsic", "intrinsic", theta=FOUND),
+    "evolved_dense": Design("evolved, dense", WITH_NETWORK, theta="ic4srl_dense"),
     "evolved_reduced": Design("evolved at 512,000", WITH_NETWORK, theta=EVOLVED),
 }
 
