@@ -322,15 +322,30 @@ def ship(args: argparse.Namespace) -> None:
     for index, part in enumerate(plan.rounds):
         if not part.winner or not was_run(args.runs, part):
             continue
-        for place, row in enumerate(scored(args.runs, plan, index)[:4]):
+        for place, (row, own) in enumerate(placed(args.runs, plan, index)):
             config, facts = read_config(folder(args.runs, row["rule"], row["seed"]))
             name = f"{part.winner}_runner_up_{place}" if place else part.winner
-            card = make_card(row, part, config) | {"commit": facts["commit"]}
+            card = make_card(row, own, config) | {"commit": facts["commit"]}
             save_cost(where / name, row["theta"], to_json(card))
             if place == 0 and not args.smoke:
                 SHIPPED.mkdir(exist_ok=True)
                 save_cost(SHIPPED / name, row["theta"], to_json(card))
             print(name, card["found"], json.dumps(card["validation"]))
+
+
+def placed(
+    runs: Path, plan: Plan, index: int
+) -> list[tuple[dict[str, Any], Round]]:
+    """The four best of a round, with the round that scored them.
+
+    Those who did not get as far follow as they were placed in the round before.
+    """
+    part, before = plan.rounds[index], plan.rounds[index - 1]
+    rows = [(row, part) for row in scored(runs, plan, index)]
+    if index and before.rules == part.rules:
+        left = scored(runs, plan, index - 1)[part.entrants :]
+        rows += [(row, before) for row in left]
+    return rows[:4]
 
 
 def make_card(row: dict[str, Any], part: Round, config: SearchConfig) -> dict[str, Any]:
