@@ -203,10 +203,12 @@ def test_round_trip(tmp_path, name):
 
 
 def test_costs_of_the_package_load_by_name(tmp_path, monkeypatch):
-    assert "ic4srl_reduced" in list_costs()
+    dense, nearest = ("ic4srl_dense", "ic4srl_reduced"), ("ic4srl", "ic4srl_nearest")
+    sizes = dict.fromkeys(dense, 41) | dict.fromkeys(nearest, 13)
+    assert set(list_costs()) == set(sizes)
     for name in list_costs():
         theta = load_cost(name)
-        assert theta.shape == (13 if name.endswith("_nearest") else 41,)
+        assert theta.shape == (sizes[name],)
         assert bool(jnp.isfinite(theta).all())
         card = cost_card(name)
         assert {"found", "budget", "validation", "fails"} <= set(card)
