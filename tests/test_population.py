@@ -220,7 +220,7 @@ for count in (1, 2, 3, 8):
 if {toy!r}:  # carried worlds have no pillars: an array without elements goes in and out
     config = train_config(segments_per_episode=2)
     program = make_population(env, agents, config, devices=jax.devices()[:2])
-    run(program, slots, program.init(slots), epochs=1)
+    jax.block_until_ready(program.chunk(program.init(slots), slots, 0))
 print(json.dumps(collectives))
 """
 
