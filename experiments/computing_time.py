@@ -97,10 +97,9 @@ def collect(benchmarks: Path) -> dict[str, Any]:
 
 def on_a_gpu(file: Path) -> dict[str, Any] | None:
     """The whole evolution at the rate of its own program, if that was measured."""
-    if not file.exists():
-        return None
-    part = json.loads(file.read_text())["parts"]["closed_form"]
-    return {
+    parts = json.loads(file.read_text())["parts"] if file.exists() else {}
+    part = parts.get("closed_form")
+    return part and {
         "device": part["facts"]["device"],
         "command": part["command"],
         "evolution_hours": part["search_hours"],

@@ -241,8 +241,8 @@ def find(runs: Path, world: str, design: str, scale: Scale) -> Trained | None:
     It may be a round of `searches.py`.
     """
     wanted = table(world, [design], scale)
-    files = [*(runs / world).glob("*/evaluation.json"), *runs.glob("*/evaluation.json")]
-    for file in sorted(files):
+    own, rounds = (sorted(d.glob("*/evaluation.json")) for d in (runs / world, runs))
+    for file in (*own, *rounds):
         config = read_config(file.parent, TableConfig)[0]
         labels = {content(method): method.label for method in config.methods}
         same = (config.train, config.seeds) == (wanted.train, wanted.seeds)

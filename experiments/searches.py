@@ -333,9 +333,7 @@ def ship(args: argparse.Namespace) -> None:
             print(name, card["found"], json.dumps(card["validation"]))
 
 
-def placed(
-    runs: Path, plan: Plan, index: int
-) -> list[tuple[dict[str, Any], Round]]:
+def placed(runs: Path, plan: Plan, index: int) -> list[tuple[dict[str, Any], Round]]:
     """The four best of a round, with the round that scored them.
 
     Those who did not get as far follow as they were placed in the round before.

@@ -12,7 +12,7 @@ its radius R and added to the extrinsic cost:
 with a constant on top for some, and a limit. Both algorithms, two seeds; scores are
 those of the training episodes of the last 20 epochs. Shapes are no entries of the
 package's bank: this is also an example of a bank of one's own. `--at-once 2` trains two
-shapes at a time, for a CPU; what has been trained is not trained again.
+shapes at a time, as a CPU should; what has been trained is not trained again.
 """
 
 import argparse
@@ -26,15 +26,16 @@ import jax.numpy as jnp
 import numpy as np
 import paper
 
-from autocost_jax import CostTerm, Slot, TrainingCost, make_env, make_population
+from autocost_jax import CostTerm, Slot, make_env, make_population
 from autocost_jax.config import THETA_SIZES
-from autocost_jax.costs import BANK
+from autocost_jax.costs import BANK, training_cost
 from autocost_jax.population import make_agents, stack_slots
 from autocost_jax.records import CostInputs
 from autocost_jax.rundata import to_json
 from autocost_jax.store import run_facts
 
-SEEDS, LAST = (0, 1), 20
+SEEDS = (0, 1)
+LAST = 20  # epochs whose training episodes are scored
 SCORES = {
     "return": "ep_return",
     "cost": "ep_cost",
@@ -49,7 +50,7 @@ class Shape(NamedTuple):
     Attributes:
       kind: hinge, step or bowl.
       multiple: m, radii from the centre of an object to where it falls silent.
-      height: h, a metre (hinge and bowl) or a step (step).
+      height: h, the cost of a step for each metre inside, or of each step inside.
       constant: added everywhere.
       limit: allowed training cost of an episode.
     """
@@ -59,6 +60,12 @@ class Shape(NamedTuple):
     height: float = 1.0
     constant: float = 0.0
     limit: float = 0.0
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether its width alone sets it apart from others of its kind."""
+        usual = 0.1 if self.kind == "step" else 1.0
+        return self.height == usual and not self.constant and not self.limit
 
     @property
     def title(self) -> str:
@@ -107,13 +114,15 @@ TRIED = (
     *(Shape("hinge", m, 10.0) for m in (2.0, 1.5)),
 )
 
+MARKERS = {"margin_2x": "D", "evolved": "*", "evolved_dense": "P"}
+
 
 def slot(shape: Shape, seed: int) -> Slot:
     """What trains one shape with one seed."""
-    weights = {"extrinsic": 1.0, shape.kind: shape.height, "constant": shape.constant}
-    theta = jnp.zeros(THETA_SIZES["nearest"]).at[0].set(shape.multiple)
-    row = jnp.asarray([weights.get(term.name, 0.0) for term in SHAPES])
-    cost = TrainingCost(weights=row, theta=theta, limit=jnp.asarray(shape.limit))
+    terms = f"extrinsic+{shape.height}*{shape.kind}+{shape.constant}*constant"
+    theta = np.zeros(THETA_SIZES["nearest"])
+    theta[0] = shape.multiple
+    cost = training_cost(terms, theta, shape.limit, SHAPES)
     return Slot(cost, jax.random.key(seed), jnp.ones(()))
 
 
@@ -135,24 +144,25 @@ def train(shapes: Sequence[Shape], scale: paper.Scale) -> Iterator[dict[str, Any
         own = slice(len(SEEDS) * index, len(SEEDS) * (index + 1))
         yield {"shape": shape._asdict()} | {
             algorithm: {
-                name: values[key][-LAST:, own].mean(0).round(5).tolist()
+                name: values[key][-LAST:, own].mean(0, float).round(5).tolist()
                 for name, key in SCORES.items()
             }
             for algorithm, values in zip(paper.BOTH, whole, strict=True)
         }
 
 
-def trained(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """The rows of all shapes that have been trained."""
-    file = args.runs / "shapes.jsonl"
+def trained(runs: Path) -> dict[Shape, dict[str, Any]]:
+    """The rows of the shapes that have been trained, in the order of `TRIED`."""
+    file = runs / "shapes.jsonl"
     lines = file.read_text().splitlines() if file.exists() else ()
-    return [json.loads(line) for line in lines]
+    rows = {Shape(**row["shape"]): row for row in map(json.loads, lines)}
+    return {shape: rows[shape] for shape in TRIED if shape in rows}
 
 
 def run(args: argparse.Namespace) -> None:
     """Train what is missing, some shapes at a time."""
     scale, known = paper.scales()[args.scale], TRIED[:2] if args.smoke else TRIED
-    done = [Shape(**row["shape"]) for row in trained(args)]
+    done = trained(args.runs)
     missing = [shape for shape in known if shape not in done]
     facts = run_facts()
     facts.pop("seed")
@@ -165,7 +175,7 @@ def run(args: argparse.Namespace) -> None:
 
 def collect(args: argparse.Namespace) -> None:
     """JSON, table and picture."""
-    rows = trained(args)
+    rows = list(trained(args.runs).values())
     facts = {json.dumps(row.pop("facts"), sort_keys=True) for row in rows}
     config = paper.scales()[args.scale].train
     result = {
@@ -219,12 +229,12 @@ def draw(result: dict[str, Any], file: Path, margins: Path) -> None:
     panels = picture.subplots(1, 2, sharey=True)
     for panel, algorithm in zip(panels, paper.BOTH, strict=True):
         for index, kind in enumerate(("hinge", "step", "bowl")):
-            for flat in (True, False):  # a plain one, or with a limit or a constant
+            for is_plain in (True, False):
                 own = [
                     row[algorithm]
                     for row in result["shapes"]
                     if row["shape"]["kind"] == kind
-                    and flat == (not row["shape"]["limit"] + row["shape"]["constant"])
+                    and Shape(**row["shape"]).is_plain == is_plain
                 ]
                 if own:
                     panel.plot(
@@ -232,21 +242,18 @@ def draw(result: dict[str, Any], file: Path, margins: Path) -> None:
                         [100 * np.mean(row["violating"]) for row in own],
                         "os^"[index],
                         color=f"C{index}",
-                        fillstyle="full" if flat else "none",
-                        label=kind + ("" if flat else ", limit or constant"),
+                        fillstyle="full" if is_plain else "none",
+                        label=kind if is_plain else f"{kind}: height, limit, constant",
                     )
-        if margins.exists():
-            world = json.loads(margins.read_text())["worlds"][paper.TRAINING_WORLD]
-            for index, design in enumerate(d for d in world if "evolved" in d):
-                score = world[design]["algorithms"][algorithm]
-                panel.plot(
-                    score["return"]["mean"],
-                    100 * score["violation_rate"],
-                    "*PX"[index % 3],
-                    color="k",
-                    markersize=9,
-                    label=paper.DESIGNS[design].title,
-                )
+        for design, score in fresh_scores(margins, algorithm):
+            panel.plot(
+                score["return"]["mean"],
+                100 * score["violation_rate"],
+                MARKERS[design],
+                color="k",
+                markersize=8,
+                label=f"{paper.DESIGNS[design].title} ({score['episodes']} fresh)",
+            )
         panel.set_title(paper.NAMES[algorithm], fontsize=9)
         panel.set_xlabel("return an episode")
         panel.set_yscale("symlog", linthresh=0.2)
@@ -254,14 +261,24 @@ def draw(result: dict[str, Any], file: Path, margins: Path) -> None:
     panels[0].set_ylabel("violating episodes, %")
     lines, names = panels[0].get_legend_handles_labels()
     picture.legend(lines, names, fontsize=6, ncols=4, loc="outside lower center")
-    picture.suptitle(f"{result['title']}\n{caption(result)}", fontsize=8)
+    text = f"{result['title']}\n{caption(result)}; black: 5 seeds, fresh episodes"
+    picture.suptitle(text, fontsize=8)
     picture.savefig(file, dpi=130)
+
+
+def fresh_scores(margins: Path, algorithm: str) -> list[tuple[str, dict[str, Any]]]:
+    """Scores of the designs of `MARKERS` over fresh episodes, if there are any."""
+    if not margins.exists():
+        return []
+    world = json.loads(margins.read_text())["worlds"][paper.TRAINING_WORLD]
+    known = [design for design in MARKERS if design in world]
+    return [(design, world[design]["algorithms"][algorithm]) for design in known]
 
 
 PARTS = {"run": run, "collect": collect}
 
 if __name__ == "__main__":
     flags = paper.parser(__doc__, PARTS, scales=("reduced", "reduced_10m"))
-    flags.add_argument("--at-once", type=int, default=len(TRIED), help="shapes")
+    flags.add_argument("--at-once", type=int, default=len(TRIED), help="shapes trained")
     options = paper.arguments(flags)
     PARTS[options.part](options)

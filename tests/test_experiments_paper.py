@@ -153,6 +153,8 @@ def test_computing_times_are_steps_over_rate_and_updates(tmp_path):
     (tmp_path / "env_steps.json").write_text(json.dumps({"rows": steps}))
     with pytest.raises(SystemExit, match="different devices"):
         computing_time.collect(tmp_path)
+    file.write_text(json.dumps({"parts": {"update": closed}}))
+    assert computing_time.on_a_gpu(file) is None
 
 
 def test_the_table_of_computing_times_is_that_of_the_benchmarks():
@@ -308,6 +310,22 @@ def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
     assert (tmp_path / "evolution.png").exists()
 
 
+def test_runners_up_follow_from_the_round_before(tmp_path):
+    """One cost is validated; who came behind it is known from the shortlist."""
+    runs = tmp_path / "runs"
+    write_search(runs, [[1.0, 2.0, 3.0, 4.0]] * 2, [[5.0] * 4] * 2)
+    first = PLAN.rounds[0]._replace(entrants=3)
+    last = PLAN.rounds[1]._replace(entrants=1)
+    plan = PLAN._replace(rounds=(first, last))
+    scores = [[(5.0, cost, 9)] * 2 for cost in (0.3, 0.1, 0.2, 0.4, 0.5, 0.6, 0.7)]
+    write_round(runs, 0, scores)
+    order = [row["index"] for row in searches.scored(runs, plan, 0)]
+    write_round(runs, 1, scores)
+    rows = searches.placed(runs, plan, 1)
+    assert [row["index"] for row, _ in rows] == order
+    assert [part.name for _, part in rows] == ["validation", "shortlist", "shortlist"]
+
+
 def test_rounds_wait_for_their_searches(tmp_path, capsys):
     args = argparse.Namespace(runs=tmp_path, smoke=True, scale="smoke")
     searches.validate(args)
@@ -403,12 +421,21 @@ def test_a_shape_costs_what_its_name_says():
 def test_shapes_from_training_to_picture(tmp_path):
     """In two goes; what is trained is not trained again."""
     words = ["--smoke", "--runs", str(tmp_path / "runs"), "--results", str(tmp_path)]
-    for part in ("run", "run", "collect"):
-        subprocess.run(
-            [sys.executable, "experiments/shapes.py", part, *words],
-            check=True,
-            cwd=ROOT,
-        )
+    file = tmp_path / "runs" / "shapes.jsonl"
+
+    def start(part):
+        command = [sys.executable, "experiments/shapes.py", part, *words]
+        subprocess.run([*command, "--at-once", "1"], check=True, cwd=ROOT)
+
+    start("run")
+    first, second = file.read_text().splitlines()
+    file.write_text(second + "\n")
+    start("run")
+    assert file.read_text().splitlines()[0] == second
+    again = json.loads(file.read_text().splitlines()[1])
+    for algorithm in paper.BOTH:
+        assert again[algorithm] == json.loads(first)[algorithm]
+    start("collect")
     result = json.loads((tmp_path / "shapes.json").read_text())
     assert [row["shape"] for row in result["shapes"]] == [
         shape._asdict() for shape in shapes.TRIED[:2]
@@ -419,7 +446,15 @@ def test_shapes_from_training_to_picture(tmp_path):
             assert set(row[algorithm]) == set(shapes.SCORES)
             assert all(len(values) == 2 for values in row[algorithm].values())
     assert "| hinge 1.25x |" in (tmp_path / "shapes.md").read_text()
-    assert (tmp_path / "shapes.png").stat().st_size > 10_000
+    assert (tmp_path / "shapes.png").exists()
+
+
+def test_fresh_scores_stand_beside_the_shapes(tmp_path):
+    file = ROOT / "experiments" / "results" / "reduced_10m" / "margins.json"
+    found = dict(shapes.fresh_scores(file, "cpo"))
+    assert list(found) == list(shapes.MARKERS)
+    assert found["margin_2x"]["episodes"] == 1000
+    assert shapes.fresh_scores(tmp_path / "none.json", "cpo") == []
 
 
 def test_one_figure_from_training_to_picture(tmp_path):
