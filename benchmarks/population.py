@@ -87,10 +87,8 @@ def with_physics(config: SearchConfig, physics: Any) -> SearchConfig:
     return dataclasses.replace(config, train=train)
 
 
-def with_chunks(config: SearchConfig, epochs: int | None) -> SearchConfig:
-    """The same search with other chunks, None: with its own."""
-    if epochs is None:
-        return config
+def with_chunks(config: SearchConfig, epochs: int) -> SearchConfig:
+    """The same search with chunks of another length."""
     train = dataclasses.replace(config.train, chunk_epochs=epochs)
     return dataclasses.replace(config, train=train)
 
@@ -115,7 +113,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder")
     options = parser.parse_args()
     devices = use_devices(options.devices)
-    config = with_chunks(preset(options.preset), options.chunk_epochs)
+    config = preset(options.preset)
+    if options.chunk_epochs:
+        config = with_chunks(config, options.chunk_epochs)
     fast = with_physics(config, "closed_form")
     measure: dict[str, Callable[[], list[Any]]] = {
         "mjx": lambda: search_speeds(config, devices),

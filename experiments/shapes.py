@@ -102,19 +102,19 @@ SHAPES = (
     CostTerm("bowl", _bowl),
     CostTerm("constant", _constant),
 )
-LIMITS = ((1.5, 0.5), (1.5, 2.0), (2.0, 0.5), (2.0, 2.0), (2.0, 8.0), (2.5, 2.0))
+LIMITS = ((1.5, 0.5), (1.5, 2.0), (2.0, 0.5), (2.0, 2.0), (2.0, 8.0))
+LIMITS += ((2.5, 2.0), (2.5, 8.0))
 STEPS = ((1.25, 0.1), (1.5, 0.1), (1.75, 0.1), (2.0, 0.1), (1.5, 0.01), (2.0, 0.01))
 TRIED = (
     *(Shape("hinge", m) for m in (1.25, 1.5, 1.75, 2.0, 2.25, 2.5)),
     *(Shape("hinge", m, 0.1) for m in (1.5, 2.0, 2.5)),
-    *(Shape("hinge", m, limit=limit) for m, limit in (*LIMITS, (2.5, 8.0))),
+    *(Shape("hinge", m, limit=limit) for m, limit in LIMITS),
     *(Shape("step", m, height) for m, height in STEPS),
     *(Shape("bowl", m) for m in (2.0, 2.5, 3.0)),
     *(Shape("hinge", 2.0, constant=constant) for constant in (1e-4, 1e-3)),
     *(Shape("hinge", m, 10.0) for m in (2.0, 1.5)),
 )
-
-MARKERS = {"margin_2x": "D", "evolved": "*", "evolved_dense": "P"}
+MARKERS = {"margin_2x": "D", "evolved": "*", "evolved_dense": "P"}  # of `margins.py`
 
 
 def slot(shape: Shape, seed: int) -> Slot:

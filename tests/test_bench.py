@@ -66,6 +66,26 @@ def rates(monkeypatch):
     return calls
 
 
+def test_a_timed_call_can_be_one_epoch(monkeypatch, tmp_path):
+    """`--chunk-epochs`: only the chunk differs from the preset."""
+    script, configs = load_script("benchmarks/population"), []
+
+    def speeds(config, devices):
+        configs.append(config)
+        return []
+
+    monkeypatch.setattr(script, "search_speeds", speeds)
+    monkeypatch.setattr(script, "use_devices", lambda count: jax.devices()[:1])
+    words = ["population.py", "--preset", "paper", "--parts", "mjx"]
+    for more in ([], ["--chunk-epochs", "1"]):
+        monkeypatch.setattr("sys.argv", [*words, *more, "--out", str(tmp_path)])
+        script.main()
+    usual, short = configs
+    assert usual == preset("paper")
+    train = dataclasses.replace(usual.train, chunk_epochs=1)
+    assert short == dataclasses.replace(usual, train=train)
+
+
 def test_update_speed_is_the_difference_of_two_programs(rates):
     train = preset("laptop").train
     row = update_speed(train, "cpo", 3, jax.devices()[:1])
