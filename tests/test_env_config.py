@@ -1,4 +1,4 @@
-"""The table of worlds: the twelve of this project, and Safety Gym's own suite."""
+"""The table of worlds: this project's own, and Safety Gym's suite."""
 
 import dataclasses
 
@@ -9,8 +9,9 @@ from autocost_jax.env_config import ENVS, SUITE, EnvConfig, env_config
 # kind -> number, radius, keepout
 EIGHT_HAZARDS, FOUR_HAZARDS = (8, 0.3, 0.4), (4, 0.3, 0.4)
 FOUR_PILLARS = (4, 0.2, 0.3)
-TWELVE = {
-    ("Goal", "Hazard"): {"hazards": EIGHT_HAZARDS},
+OWN = {
+    ("Goal", "Hazard"): {"hazards": FOUR_HAZARDS},
+    ("Goal", "Hazard8"): {"hazards": EIGHT_HAZARDS},
     ("Push", "Hazard"): {"hazards": FOUR_HAZARDS},
     ("Goal", "Pillar"): {"pillars": FOUR_PILLARS},
     ("Push", "Pillar"): {"pillars": FOUR_PILLARS},
@@ -91,7 +92,7 @@ def assert_shared(config: EnvConfig, extent: float, goal_keepout: float) -> None
     assert config.physics == "reduced"
 
 
-def test_the_names_of_the_twelve():
+def test_the_names_of_our_worlds():
     assert list(ENVS) == [
         "Goal-Hazard-Point",
         "Goal-Hazard-Car",
@@ -105,18 +106,21 @@ def test_the_names_of_the_twelve():
         "Push-Pillar-Point",
         "Push-Pillar-Car",
         "Push-Pillar-Doggo",
+        "Goal-Hazard8-Point",
+        "Goal-Hazard8-Car",
+        "Goal-Hazard8-Doggo",
     ]
     assert ENVS["Goal-Hazard-Point"] == EnvConfig()
 
 
 @pytest.mark.parametrize("name", ENVS)
-def test_the_twelve(name):
+def test_our_worlds(name):
     config = env_config(name)
     task, constraint, robot = name.split("-")
     assert (config.task, config.robot, config.name) == (task, robot, name)
     assert_shared(config, extent=2, goal_keepout=0.4)
-    assert objects(config) == TWELVE[task, constraint]
-    kind = f"{constraint.lower()}s"
+    assert objects(config) == OWN[task, constraint]
+    kind = f"{constraint.lower().rstrip('8')}s"
     assert list(config.constrained) == observed(config) == [kind]
     if task == "Push":
         assert box(config) == BOX[robot]
@@ -161,7 +165,7 @@ def test_the_suite(name):
 @pytest.mark.parametrize(
     ("name", "keepouts"),
     [
-        ("Goal-Hazard-Car", [0.4, 0.4, *8 * [0.4]]),
+        ("Goal-Hazard-Car", [0.4, 0.4, *4 * [0.4]]),
         ("Push-Pillar-Car", [0.4, 0.4, 0.27, *4 * [0.3]]),
         ("PointGoal1", [0.4, 0.305, *8 * [0.18], 0.15]),
         ("DoggoPush2", [0.4, 0.4, 0.2, *4 * [0.4], *4 * [0.3]]),
@@ -189,4 +193,16 @@ def test_a_world_without_a_constraint_is_refused(change):
         EnvConfig(), pillars_num=1, constrain_pillars=True, **change
     )
     assert with_pillar.constrained == ("pillars",)
-    assert with_pillar.name == "Goal-Pillar-Point"
+    assert with_pillar.name == "Goal-Pillar1-Point-custom"
+
+
+@pytest.mark.parametrize("name", [*ENVS, *SUITE])
+def test_a_world_keeps_its_name_in_other_lengths_and_models(name):
+    short = dataclasses.replace(env_config(name), num_steps=50, physics="full")
+    assert short.name == name
+
+
+def test_a_changed_world_does_not_bear_the_name_of_another():
+    changed = dataclasses.replace(EnvConfig(), hazards_num=6)
+    assert changed.name == "Goal-Hazard6-Point-custom"
+    assert EnvConfig(hazards_size=0.2).name == "Goal-Hazard4-Point-custom"

@@ -299,7 +299,7 @@ def _envs(argv: list[str]) -> None:
         """A picture and the facts of every world, and a page that shows them all.
 
         Attributes:
-          names: worlds that `autocost info` lists; default: the twelve.
+          names: worlds that `autocost info` lists; default: all but Safety Gym's.
           out: folder to write to.
           seed: of the layouts.
         """

@@ -1,4 +1,4 @@
-"""Configuration of the worlds: the twelve of this project and Safety Gym's own suite.
+"""Configuration of the worlds: this project's own and Safety Gym's suite.
 
 `EnvConfig` keeps Safety Gym's keys letter for letter, so that a configuration can be
 compared with the original's. Every default marked *ours* is a choice that neither the
@@ -29,9 +29,11 @@ LIDAR_BINS = 8  # the paper's constraint lidar: the intrinsic network's input
 class EnvConfig:
     """One Safety Gym world; lengths in metres, names as in Safety Gym's engine.
 
-    The default is the paper's training environment, Goal-Hazard-Point. Counts, radii,
-    extents and keepouts are ours (the paper does not state them): engine defaults where
-    Safety Gym has one, 8 hazards as in its Goal1. `env_config` has all the others.
+    The default is the paper's training environment, Goal-Hazard-Point. The paper does
+    not state counts, radii, extents and keepouts: these are engine defaults where Safety
+    Gym has one, and 4 hazards as in the configurations that its authors' lab published
+    before it (ISSA 2021, Safety Index Synthesis 2022). Later ones of that lab (GUARD)
+    have 8, the crowded `Goal-Hazard8-*`. `env_config` has all the others.
 
     `physics` chooses the model: "full" has Safety Gym's geoms at condim 6 (pillars as
     capsules, which MJX needs), "reduced" fewer and simpler contacts with the same
@@ -53,7 +55,7 @@ class EnvConfig:
     box_keepout: float = 0.425  # ours: the box's reach; Safety Gym's 0.2 overlaps
     box_density: float = 0.001
     box_null_dist: float = 0.0
-    hazards_num: int = 8
+    hazards_num: int = 4
     hazards_size: float = 0.3
     hazards_keepout: float = 0.4
     hazards_cost: float = 1.0
@@ -154,9 +156,23 @@ class EnvConfig:
 
     @property
     def name(self) -> str:
-        """`{task}-{constraint}-{robot}`, as the paper writes it."""
-        kinds = "+".join(kind.capitalize()[:-1] for kind in self.constrained)
-        return f"{self.task}-{kinds}-{self.robot}"
+        """The world's name, whatever its episode length and collision model.
+
+        That of `env_config` for the worlds it knows. Any other is called
+        `{task}-{kind and number of what costs}-{robot}-custom`, such as
+        "Goal-Hazard6-Point-custom".
+        """
+        plain = dataclasses.replace(
+            self, num_steps=EnvConfig.num_steps, physics=EnvConfig.physics
+        )
+        for name, known in {**ENVS, **SUITE}.items():
+            if plain == known:
+                return name
+        kinds = "+".join(
+            f"{kind.capitalize()[:-1]}{getattr(self, f'{kind}_num')}"
+            for kind in self.constrained
+        )
+        return f"{self.task}-{kinds}-{self.robot}-custom"
 
 
 _NUMBERS = ("hazards_num", "pillars_num", "vases_num")
@@ -207,10 +223,10 @@ _POSITIVE = (
 
 
 def _paper_env(task: TaskName, constraint: str, robot: Robot) -> EnvConfig:
-    """One of the twelve: counts and sizes are ours, see `EnvConfig`."""
+    """One of the paper's twelve: counts and sizes are ours, see `EnvConfig`."""
     config = EnvConfig(task=task, robot=robot)
     if task == "Push":
-        config = dataclasses.replace(config, hazards_num=4, **_box(robot))
+        config = dataclasses.replace(config, **_box(robot))
     if constraint == "Pillar":
         config = dataclasses.replace(
             config,
@@ -274,6 +290,9 @@ ENVS: dict[str, EnvConfig] = {
     for task in get_args(TaskName)
     for constraint in ("Hazard", "Pillar")
     for robot in get_args(Robot)
+} | {
+    f"Goal-Hazard8-{robot}": EnvConfig(robot=robot, hazards_num=8)
+    for robot in get_args(Robot)
 }
 SUITE: dict[str, EnvConfig] = {
     f"{robot}{task}{level}": _suite_env(robot, task, level)
@@ -284,10 +303,11 @@ SUITE: dict[str, EnvConfig] = {
 
 
 def env_config(name: str) -> EnvConfig:
-    """The configuration of one of the twelve worlds, or of Safety Gym's suite.
+    """The configuration of a world by its name.
 
     Args:
-      name: such as "Push-Pillar-Car", or "CarPush2" for Safety Gym's own.
+      name: such as "Push-Pillar-Car", "Goal-Hazard8-Point" for the crowded variant, or
+        "CarPush2" for Safety Gym's own.
 
     Raises:
       ValueError: if there is no such world; the message lists those that exist.

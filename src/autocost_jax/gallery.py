@@ -48,7 +48,7 @@ def write_gallery(names: Sequence[str], out: Path, seed: int = 0) -> Gallery:
     PNGs by MuJoCo's renderer where an OpenGL is found, else drawings from above (SVG).
 
     Args:
-      names: worlds, of the twelve or of Safety Gym's suite.
+      names: worlds that `env_config` knows.
       out: folder.
       seed: of the layouts.
 

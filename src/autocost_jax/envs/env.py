@@ -71,7 +71,7 @@ class _Parts(NamedTuple):
 
 
 def list_envs() -> list[str]:
-    """Names of the twelve worlds; `make_env` also knows Safety Gym's own suite."""
+    """Names of this project's worlds; `make_env` also knows Safety Gym's suite."""
     return list(ENVS)
 
 
