@@ -36,10 +36,14 @@ class AgentConfig:
     `policy_passes` x `policy_minibatches` policy steps (CPO: always one full-batch
     step) and `value_passes` x `value_minibatches` critic steps. `critic_precision` is
     that of the hidden layers in the critics' own steps, nowhere else: tensorfloat32
-    (of a GPU; float32 elsewhere) or bfloat16 for speed.
+    (of a GPU; float32 elsewhere) or bfloat16 for speed. `normalize_obs` (ours) brings
+    every observation to mean 0 and deviation 1 over what the agent has seen, and
+    `multiplier_max` (ours) bounds PPO-Lagrangian's multiplier, which at a limit of 0
+    otherwise never stops growing.
     """
 
     hidden_sizes: tuple[int, ...] = (256, 256)
+    normalize_obs: bool = False
     log_std_init: float = -0.5
     gamma: float = 0.99
     gae_lambda: float = 0.97
@@ -57,6 +61,7 @@ class AgentConfig:
     critic_precision: Precision = "float32"
     multiplier_init: float = 1.0
     multiplier_lr: float = 0.05
+    multiplier_max: float | None = None
     cg_iterations: int = 10
     cg_damping: float = 0.1
     backtrack_steps: int = 10
@@ -73,6 +78,8 @@ class AgentConfig:
             "backtrack_steps",
         )
         require_finite(self, "log_std_init")
+        flag = self.normalize_obs
+        require(isinstance(flag, bool), "normalize_obs", "true or false", flag)
         known = get_args(Precision)
         require(
             self.critic_precision in known,
@@ -103,6 +110,8 @@ class AgentConfig:
             "multiplier_lr",
             "cg_damping",
         )
+        if self.multiplier_max is not None:
+            require_positive(self, "multiplier_max")
         ratio = self.backtrack_ratio
         require(0 < ratio < 1, "backtrack_ratio", "in (0, 1)", ratio)
 
@@ -282,6 +291,7 @@ class SearchConfig:
 
 
 _LAPTOP_AGENT = AgentConfig(
+    normalize_obs=True,
     hidden_sizes=(64, 64),
     policy_passes=6,
     policy_minibatches=8,

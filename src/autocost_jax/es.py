@@ -319,73 +319,122 @@ def keep_level(
     return children.at[:, -1].add(shift)
 
 
+def pool(candidates: Any, fitness: Fitness) -> Fitness:
+    """For each row the mean fitness of all rows that hold the same candidate.
+
+    An elite is trained again in every stage: its scores are then as many, and the
+    luckiest of them decides nothing. One broken training breaks the mean.
+
+    Args:
+      candidates: stacked pytree [N, ...].
+      fitness: fields [N].
+    """
+    same = jnp.ones((fitness.cost.shape[0],) * 2, bool)
+    for leaf in jax.tree.leaves(candidates):
+        equal = leaf[:, None] == leaf[None]
+        same &= equal.reshape(*same.shape, -1).all(-1)
+
+    def mean(values: jax.Array) -> jax.Array:
+        rows = jnp.where(same, values[None], 0.0)  # 0 x inf would be NaN
+        return jnp.sum(rows, 1) / jnp.sum(same, 1)
+
+    return jax.tree.map(mean, fitness)
+
+
 def _normal_start(config: SearchConfig, key: Key) -> jax.Array:
     shape = (config.population_size, config.theta_size)
     return config.init_std * jax.random.normal(key, shape, jnp.float32)
 
 
+def _paper_mutation(config: SearchConfig) -> Callable[[Key, Any, int], Any]:
+    low, high = config.mutation_low, config.mutation_high
+    return functools.partial(mutate, std=config.mutation_std, low=low, high=high)
+
+
+def _paper_rank(config: SearchConfig) -> Callable[[Fitness], jax.Array]:
+    return functools.partial(rank, zero_tolerance=config.zero_tolerance)
+
+
 def truncation_es(
     config: SearchConfig,
-    start: Callable[[Key], jax.Array] | None = None,
-    adjust: Callable[[Key, jax.Array, jax.Array], jax.Array] | None = None,
+    init: Callable[[Key], Any] | None = None,
+    mutate: Callable[[Key, Any, int], Any] | None = None,
+    rank: Callable[[Fitness], jax.Array] | None = None,
 ) -> ES:
-    """The paper's search over theta [D]: keep the best, mutate, repeat.
+    """The paper's search over any pytree: keep the best, mutate, repeat.
 
     `config.selection` "random" replaces the ranking by a random choice of elites, the
-    control that shows what selection adds.
+    control that shows what selection adds. With `config.pool_scores` candidates are
+    ranked by the mean over all stages that trained them, see `pool`.
 
     Args:
-      config: the search.
-      start: key -> first candidates [P, D]; default: N(0, `config.init_std`^2).
-      adjust: (key, elites, children) -> the children to train, such as `keep_level`.
+      config: sizes, and the numbers of the default functions.
+      init: key -> first candidates, a stacked pytree [P, ...]; default: theta [P, 41]
+        of N(0, `config.init_std`^2).
+      mutate: (key, elites [E, ...], C) -> children [C, ...]; default: the paper's
+        two mutations.
+      rank: fitness [P] -> indices [P], best first; default: the paper's rule.
     """
     size, elites = config.population_size, config.num_elites
     capacity = config.num_stages * size
-    spread = (config.mutation_std, config.mutation_low, config.mutation_high)
-    first = start or functools.partial(_normal_start, config)
+    first = init or functools.partial(_normal_start, config)
+    vary = mutate or _paper_mutation(config)
+    order = rank or _paper_rank(config)
 
-    def init() -> ESState:
+    def start() -> ESState:
+        shapes = jax.eval_shape(first, jax.random.key(0))
+
+        def zeros(num: int) -> Any:
+            return jax.tree.map(
+                lambda leaf: jnp.zeros((num, *leaf.shape[1:]), leaf.dtype), shapes
+            )
+
         return ESState(
             generation=jnp.zeros((), jnp.int32),
-            elites=jnp.zeros((elites, config.theta_size), jnp.float32),
-            archive=jnp.zeros((capacity, config.theta_size), jnp.float32),
+            elites=zeros(elites),
+            archive=zeros(capacity),
             archive_fitness=Fitness(
                 cost=jnp.full(capacity, jnp.inf, jnp.float32),
                 ep_return=jnp.full(capacity, -jnp.inf, jnp.float32),
             ),
         )
 
-    def ask(key: Key, state: ESState) -> jax.Array:
+    def ask(key: Key, state: ESState) -> Any:
         key_init, key_mutate = jax.random.split(key)
-        key_adjust = jax.random.fold_in(key, 2)  # moves no other draw
-        children = mutate(key_mutate, state.elites, size - elites, *spread)
-        if adjust is not None:
-            children = adjust(key_adjust, state.elites, children)
-        later = jnp.concatenate([state.elites, children])
+        children = vary(key_mutate, state.elites, size - elites)
+        later = jax.tree.map(
+            lambda old, new: jnp.concatenate([old, new]), state.elites, children
+        )
         return jax.lax.cond(
             state.generation == 0, lambda: first(key_init), lambda: later
         )
 
-    def tell(key: Key, state: ESState, candidates: jax.Array, fitness: Fitness):
-        if config.selection == "paper":
-            rule = (config.zero_tolerance, config.return_floor)
-            parents, _ = select(candidates, fitness, elites, *rule)
-        else:
-            parents = candidates[jax.random.permutation(key, size)[:elites]]
+    def tell(key: Key, state: ESState, candidates: Any, fitness: Fitness) -> ESState:
         place = state.generation * size
 
         def put(old: jax.Array, new: jax.Array) -> jax.Array:
             new = new.astype(old.dtype)
             return jax.lax.dynamic_update_slice_in_dim(old, new, place, 0)
 
+        archive = jax.tree.map(put, state.archive, candidates)
+        archive_fitness = jax.tree.map(put, state.archive_fitness, fitness)
+        if config.pool_scores:
+            pooled = pool(archive, archive_fitness)
+            fitness = jax.tree.map(
+                lambda x: jax.lax.dynamic_slice_in_dim(x, place, size, 0), pooled
+            )
+        if config.selection == "paper":
+            parents = order(fitness)[:elites]
+        else:
+            parents = jax.random.permutation(key, size)[:elites]
         return ESState(
             generation=state.generation + 1,
-            elites=parents,
-            archive=put(state.archive, candidates),
-            archive_fitness=jax.tree.map(put, state.archive_fitness, fitness),
+            elites=jax.tree.map(lambda x: x[parents], candidates),
+            archive=archive,
+            archive_fitness=archive_fitness,
         )
 
-    return ES(init, ask, tell)
+    return ES(start, ask, tell)
 
 
 def best(

@@ -17,6 +17,7 @@ import numpy as np
 from flax import struct
 
 from autocost_jax import cluster
+from autocost_jax.agents.base import actor
 from autocost_jax.arrays import flatten
 from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import training_cost
@@ -275,7 +276,7 @@ def _finish(
         for index, (method, seed) in enumerate(config.group(name)):
             params = jax.tree.map(
                 lambda leaf, i=i, index=index: leaf[index],
-                state.learners[i].agent.policy,
+                actor(state.learners[i].agent),
             )
             stem = f"{method.label}_seed{seed}"
             files.append(run.write_policy(stem, flatten(params)))

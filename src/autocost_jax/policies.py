@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.agents.base import Agent
+from autocost_jax.agents.base import Agent, actor
 from autocost_jax.arrays import RunDirError, load_arrays, unflatten
 from autocost_jax.config import TrainConfig
 from autocost_jax.envs.env import Env, make_env
@@ -46,12 +46,13 @@ def load_policies(train: TrainConfig, files: Sequence[Path]) -> tuple[Agent, Any
     # Whose policy it is does not matter: all agents act alike.
     (agent,) = make_agents(("ppo_lagrangian",), train, make_env(train.env))
     template = agent.init(jax.random.key(0))
-    loaded = [unflatten(load_arrays(file, None), template.policy) for file in files]
+    part = actor(template)
+    loaded = [unflatten(load_arrays(file, None), part) for file in files]
     stacked = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (len(loaded), *leaf.shape)), template
     )
-    policy = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loaded)
-    return agent, dataclasses.replace(stacked, policy=policy)
+    acting = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loaded)
+    return agent, dataclasses.replace(stacked, **acting._asdict())
 
 
 def policy_files(path: Path, names: Sequence[str] = ()) -> list[Path]:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from autocost_jax import cluster
+from autocost_jax.agents.base import actor
 from autocost_jax.arrays import flatten
 from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import make_env
@@ -308,7 +309,7 @@ def _write_stage(
     run.write_stage(progress.stage, arrays)
     top = int(result.order[0])
     for name, learner in zip(config.algorithms, progress.learners, strict=True):
-        policies = searcher.population.fetch(learner.agent.policy)
+        policies = searcher.population.fetch(actor(learner.agent))
         params = jax.tree.map(lambda leaf: leaf[top], policies)
         run.write_policy(policy_name(progress.stage, name), flatten(params))
 

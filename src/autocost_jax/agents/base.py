@@ -23,6 +23,11 @@ from autocost_jax.agents.networks import (
     log_prob,
     sample,
 )
+from autocost_jax.agents.normalizer import (
+    init_normalizer,
+    normalize_obs,
+    update_normalizer,
+)
 from autocost_jax.config import AgentConfig
 from autocost_jax.records import Key, Metrics, Trajectory
 
@@ -56,6 +61,7 @@ class AgentState(struct.PyTreeNode):
       critic_opt: Adam's state.
       multiplier: [] p, the multiplier is softplus(p); () for CPO.
       multiplier_opt: Adam's state; () for CPO.
+      normalizer: of the observations; () without `AgentConfig.normalize_obs`.
     """
 
     policy: Params
@@ -64,6 +70,41 @@ class AgentState(struct.PyTreeNode):
     critic_opt: Any
     multiplier: Any
     multiplier_opt: Any
+    normalizer: Any = ()
+
+
+class Actor(NamedTuple):
+    """The part of an `AgentState` that acts, and that a policy's file holds.
+
+    Attributes:
+      policy: parameters of the policy.
+      normalizer: of its observations, or ().
+    """
+
+    policy: Params
+    normalizer: Any
+
+
+def actor(state: AgentState) -> Actor:
+    """The acting part of an agent."""
+    return Actor(state.policy, state.normalizer)
+
+
+def start_normalizer(config: AgentConfig, env: EnvSizes) -> Any:
+    """The normalizer that an agent begins with; () if it has none."""
+    return init_normalizer(env.observation_size) if config.normalize_obs else ()
+
+
+def seen_by(state: AgentState, obs: jax.Array) -> jax.Array:
+    """Observations [..., O] as the agent's networks see them."""
+    return normalize_obs(state.normalizer, obs) if state.normalizer else obs
+
+
+def learn_obs(state: AgentState, trajectory: Trajectory) -> Any:
+    """The normalizer after an epoch; the next one acts by it."""
+    if not state.normalizer:
+        return ()
+    return update_normalizer(state.normalizer, trajectory.obs[:-1], trajectory.valid)
 
 
 class Agent(NamedTuple):
@@ -87,7 +128,7 @@ class Batch(struct.PyTreeNode):
     """One epoch of one agent as R = T * N rows.
 
     Attributes:
-      obs: [R, O].
+      obs: [R, O] as the networks see them.
       action: [R, U].
       weight: [R] 1.0 where the row counts, else 0.0; then all else in the row is 0
         (obs: that of the state in which the world failed).
@@ -116,7 +157,7 @@ def make_policy(networks: Networks) -> Callable[..., jax.Array]:
     def policy(
         state: AgentState, obs: jax.Array, key: Key, deterministic: bool = False
     ) -> jax.Array:
-        mean, log_std = networks.distribution(state.policy, obs)
+        mean, log_std = networks.distribution(state.policy, seen_by(state, obs))
         return mean if deterministic else sample(key, mean, log_std)
 
     return policy
@@ -151,6 +192,7 @@ def prepare_batch(
     # s_t counts if it was reached by a valid step: it may bootstrap the row before.
     reached = jnp.concatenate([jnp.ones_like(valid[:1]), valid])
     obs = jnp.where(reached[..., None], trajectory.obs, 0.0)
+    obs = seen_by(state, obs)
     action = jnp.where(valid[..., None], trajectory.action, 0.0)
     signal = jnp.stack([trajectory.reward, total_cost])
     signal = jnp.where(valid[None], signal, 0.0)

@@ -20,8 +20,10 @@ from autocost_jax.agents.base import (
     EnvSizes,
     as_metrics,
     critic_optimizer,
+    learn_obs,
     make_policy,
     prepare_batch,
+    start_normalizer,
     update_critics,
 )
 from autocost_jax.agents.fisher import mlp_fisher_product
@@ -229,6 +231,7 @@ def cpo(config: AgentConfig, env: EnvSizes) -> Agent:
             critic_opt=critic_optimizer(config).init(critic),
             multiplier=(),
             multiplier_opt=(),
+            normalizer=start_normalizer(config, env),
         )
 
     @full_precision
@@ -259,7 +262,12 @@ def cpo(config: AgentConfig, env: EnvSizes) -> Agent:
         critic, critic_opt, critic_norm = update_critics(
             config, networks, state.critic, state.critic_opt, batch, key
         )
-        new_state = state.replace(policy=policy, critic=critic, critic_opt=critic_opt)
+        new_state = state.replace(
+            policy=policy,
+            critic=critic,
+            critic_opt=critic_opt,
+            normalizer=learn_obs(state, trajectory),
+        )
         metrics = {
             **metrics,
             **policy_metrics,

@@ -21,9 +21,11 @@ from autocost_jax.agents.base import (
     as_metrics,
     critic_optimizer,
     global_norm,
+    learn_obs,
     make_policy,
     prepare_batch,
     split_rows,
+    start_normalizer,
     update_critics,
 )
 from autocost_jax.agents.blocks import mean_over_blocks
@@ -50,7 +52,7 @@ def update_multiplier(
     """One Adam step on p, whose softplus is the multiplier: dp = -(J_c - d).
 
     Args:
-      config: learning rate.
+      config: learning rate and bound.
       multiplier: [] p.
       opt_state: Adam's state.
       j_c: [] mean episode cost of this epoch.
@@ -62,7 +64,14 @@ def update_multiplier(
     updates, opt_state = optax.adam(config.multiplier_lr).update(
         -(j_c - limit), opt_state
     )
-    return optax.apply_updates(multiplier, updates), opt_state  # pyright: ignore
+    multiplier: Any = optax.apply_updates(multiplier, updates)
+    if config.multiplier_max is not None:
+        multiplier = jnp.minimum(multiplier, _inverse_softplus(config.multiplier_max))
+    return multiplier, opt_state
+
+
+def _inverse_softplus(value: float) -> float:
+    return float(np.log(np.expm1(value)))
 
 
 def clipped_objective(
@@ -239,8 +248,7 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
     def init(key: Key) -> AgentState:
         policy, critic = networks.init(key)
         dtype = jnp.result_type(float)
-        # softplus(p) = multiplier_init
-        p = jnp.asarray(np.log(np.expm1(config.multiplier_init)), dtype)
+        p = jnp.asarray(_inverse_softplus(config.multiplier_init), dtype)
         return AgentState(
             policy=policy,
             critic=critic,
@@ -248,6 +256,7 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
             critic_opt=critic_optimizer(config).init(critic),
             multiplier=p,
             multiplier_opt=optax.adam(config.multiplier_lr).init(p),
+            normalizer=start_normalizer(config, env),
         )
 
     @full_precision
@@ -289,6 +298,7 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
             critic_opt=critic_opt,
             multiplier=p,
             multiplier_opt=multiplier_opt,
+            normalizer=learn_obs(state, trajectory),
         )
         metrics = {
             **metrics,
