@@ -1,0 +1,205 @@
+"""Which fitness tells the truth? Rank correlation of a stage's scores with the truth.
+
+    python experiments/fitness.py run      # trains everything; an hour on a GPU's worth
+    python experiments/fitness.py collect  # JSON, table
+
+Random costs of the paper's network are trained three times, with other seeds each time:
+
+    truth   from scratch for 2,000,000 steps, 5 seeds, then 200 fresh episodes each
+    short   from scratch for 768,000 steps, 5 seeds: what a stage of a search sees
+    warm    for 512,000 steps more from one policy an algorithm and seed, trained with
+            the extrinsic cost alone in `short`
+
+A rule of a search is a length, a number of seeds, episodes that count, and a way to
+judge by both agents. Its fitness is computed from `short` or `warm` and compared with the
+truth of the same costs. Costs of the extrinsic term alone and of a margin of 3x are
+trained beside them as references.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from autocost_jax.agents.base import actor
+from autocost_jax.arrays import flatten
+from autocost_jax.commandline import use_devices
+from autocost_jax.config import EnvConfig, TrainConfig, preset
+from autocost_jax.costs import training_cost
+from autocost_jax.envs.env import Env, make_env
+from autocost_jax.es import graded_start
+from autocost_jax.evaluate import evaluate
+from autocost_jax.population import Population, make_agents, make_population
+from autocost_jax.records import Slot
+from autocost_jax.rollout import typical_lidars
+from autocost_jax.store import run_facts
+
+ALGORITHMS = ("ppo_lagrangian", "cpo")
+REFERENCES = ("extrinsic", "extrinsic+safety_margin_3x")
+KEPT = ("ep_cost", "ep_return", "violating_worlds", "ep_total_cost")
+
+
+class Size(NamedTuple):
+    """How much is trained.
+
+    Attributes:
+      graded: costs of a graded start.
+      normal: costs of N(0, 5^2).
+      seeds: of each cost and training.
+      truth: epochs.
+      short: epochs.
+      warm: epochs.
+      episodes: of the truth's evaluation, a seed.
+    """
+
+    graded: int = 50
+    normal: int = 12
+    seeds: int = 5
+    truth: int = 250
+    short: int = 96
+    warm: int = 64
+    episodes: int = 200
+
+
+SMOKE = Size(graded=2, normal=1, seeds=2, truth=2, short=2, warm=1, episodes=4)
+
+
+def costs(env: Env, size: Size) -> np.ndarray:
+    """theta [C, 41] of all costs; the references' are unused zeros, in front."""
+    key_graded, key_normal = jax.random.split(jax.random.key(2026))
+    places = typical_lidars(env, jax.random.key(0))
+    graded = graded_start(key_graded, size.graded, 8.0, places)
+    normal = 5.0 * jax.random.normal(key_normal, (size.normal, 41))
+    none = jnp.zeros((len(REFERENCES), 41))
+    return np.asarray(jnp.concatenate([none, graded, normal]))
+
+
+def make_slots(theta: np.ndarray, size: Size, first_seed: int) -> tuple[Slot, ...]:
+    """Slots [C * S] of each algorithm, cost by cost; a key for each seed."""
+    weights = [training_cost(name, theta[0]).weights for name in REFERENCES]
+    network = training_cost("extrinsic+intrinsic", theta[0])
+    weights += [network.weights] * (len(theta) - len(REFERENCES))
+    num = len(theta) * size.seeds
+
+    def each(rows: Any) -> jax.Array:
+        return jnp.repeat(jnp.asarray(np.stack(rows)), size.seeds, axis=0)
+
+    cost = network.replace(
+        weights=each(weights), theta=each(theta), limit=jnp.zeros(num)
+    )
+    groups = []
+    for index in range(len(ALGORITHMS)):
+        root = jax.random.key(index)
+        keys = [jax.random.fold_in(root, first_seed + s) for s in range(size.seeds)]
+        keys = jnp.tile(jnp.stack(keys), len(theta))
+        groups.append(Slot(cost=cost, key=keys, constrained=jnp.ones(num)))
+    return tuple(groups)
+
+
+def train(
+    population: Population, learners: Any, slots: Any, epochs: int, what: str
+) -> tuple[Any, dict[str, np.ndarray]]:
+    """Learners after so many epochs, and `KEPT` metrics [E, A, C * S]."""
+    rows, start = [], time.monotonic()
+    for epoch in range(epochs):
+        learners, metrics = population.chunk(learners, slots, epoch)
+        rows.append([{name: group[name][0] for name in KEPT} for group in metrics])
+        if epoch % 16 == 0:
+            jax.block_until_ready(metrics)
+            print(f"{what} {epoch}: {time.monotonic() - start:.0f} s", flush=True)
+    rows = jax.device_get(rows)
+    kept = {name: np.asarray([[g[name] for g in r] for r in rows]) for name in KEPT}
+    return learners, kept
+
+
+def warm_start(population: Population, learners: Any, slots: Any, size: Size) -> Any:
+    """Fresh learners with the networks of the extrinsic cost's agents, by seed."""
+    fresh = population.init(slots)
+    groups = []
+    for new, old in zip(fresh, learners, strict=True):
+        index = np.tile(np.arange(size.seeds), new.frozen.shape[0] // size.seeds)
+        taken = jax.tree.map(lambda leaf, index=index: leaf[index], old.agent)
+        agent = new.agent.replace(
+            policy=taken.policy, critic=taken.critic, normalizer=taken.normalizer
+        )
+        groups.append(new.replace(agent=agent))
+    return tuple(groups)
+
+
+def run(path: Path, size: Size, config: TrainConfig) -> None:
+    """All three trainings and the evaluation, into one npz."""
+    env = make_env(config.env)
+    agents = make_agents(ALGORITHMS, config, env)
+    population = make_population(env, agents, config, devices=jax.devices())
+    theta = costs(env, size)
+    arrays: dict[str, np.ndarray] = {"theta": theta}
+
+    def keep(name: str, metrics: dict[str, np.ndarray]) -> None:
+        for key, value in metrics.items():
+            shape = (*value.shape[:2], len(theta), size.seeds)
+            arrays[f"{name}/{key}"] = value.reshape(shape).astype(np.float32)
+        np.savez_compressed(path / "fitness.npz", **arrays)
+
+    slots = make_slots(theta, size, 100)
+    learners, metrics = train(
+        population, population.init(slots), slots, size.short, "short"
+    )
+    keep("short", metrics)
+    slots = make_slots(theta, size, 200)
+    learners = warm_start(population, learners, slots, size)
+    learners, metrics = train(population, learners, slots, size.warm, "warm")
+    keep("warm", metrics)
+    slots = make_slots(theta, size, 0)
+    learners, metrics = train(
+        population, population.init(slots), slots, size.truth, "truth"
+    )
+    keep("truth", metrics)
+
+    score = jax.jit(
+        jax.vmap(
+            lambda state, key: evaluate(env, agents[0], state, key, size.episodes),
+            in_axes=(0, None),
+        )
+    )
+    template = agents[0].init(jax.random.key(0))
+    results, policies = [], {}
+    for name, group in zip(ALGORITHMS, learners, strict=True):
+        acting = actor(jax.device_get(group.agent))
+        count = len(theta) * size.seeds
+        state = jax.tree.map(lambda x, n=count: jnp.broadcast_to(x, (n, *x.shape)), template)
+        results.append(score(state.replace(**acting._asdict()), jax.random.key(99)))
+        first = jax.tree.map(lambda x: x[:: size.seeds], acting)
+        policies |= {f"{name}/{key}": x for key, x in flatten(first).items()}
+    for field in ("ep_return", "ep_cost"):
+        value = np.stack([np.asarray(getattr(r, field)) for r in results])
+        shape = (len(ALGORITHMS), len(theta), size.seeds, size.episodes)
+        arrays[f"evaluation/{field}"] = value.reshape(shape)
+    np.savez_compressed(path / "fitness.npz", **arrays)
+    np.savez_compressed(path / "policies.npz", **policies)
+    facts = {"size": size._asdict(), "facts": run_facts()}
+    (path / "facts.json").write_text(json.dumps(facts, indent=1, default=str))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=("run", "collect"))
+    parser.add_argument("--out", type=Path, default=Path("runs/fitness"))
+    parser.add_argument("--smoke", action="store_true")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    use_devices(None)
+    config = preset("laptop").train
+    env = EnvConfig(physics="closed_form")
+    if args.smoke:
+        env = EnvConfig(physics="closed_form", num_steps=100)
+    config = TrainConfig(env=env, agent=config.agent, num_worlds=config.num_worlds, num_epochs=1)
+    run(args.out, SMOKE if args.smoke else Size(), config)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""What each learner setting of the `laptop` preset is worth at equal env steps.
+
+    python experiments/learners.py run                 # all settings, one process each
+    python experiments/learners.py run --only NAME     # one of them
+    python experiments/learners.py collect             # JSON and table
+
+Every setting trains PPO-Lagrangian and CPO on Goal-Hazard-Point in closed form for
+512,000 env steps a slot with five seeds and three costs: the extrinsic one alone, and
+with a margin of 2x and 3x. Scores are of 200 fresh episodes a seed, actions sampled.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from autocost_jax.agents.base import actor
+from autocost_jax.commandline import use_devices
+from autocost_jax.config import AgentConfig, EnvConfig, TrainConfig
+from autocost_jax.envs.env import make_env
+from autocost_jax.evaluate import evaluate
+from autocost_jax.methods import Method, TableConfig, table_slots
+from autocost_jax.population import make_agents, make_population
+from autocost_jax.store import run_facts
+
+STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
+COSTS = ("extrinsic", "extrinsic+safety_margin_2x", "extrinsic+safety_margin_3x")
+BASE: dict[str, Any] = {
+    "hidden_sizes": (64, 64),
+    "policy_passes": 6,
+    "policy_minibatches": 8,
+    "value_passes": 6,
+    "value_minibatches": 8,
+}
+NORM = {"normalize_obs": True}
+# name -> worlds an epoch, segments per episode, agent settings that differ from BASE
+SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
+    "as before": (8, 1, {}),
+    "normalised": (8, 1, NORM),
+    "4 worlds": (4, 1, NORM),
+    "2 worlds": (2, 1, NORM),
+    "4 worlds, KL 0.02": (4, 1, NORM | {"target_kl": 0.02}),
+    "4 worlds, multiplier lr 0.02": (4, 1, NORM | {"multiplier_lr": 0.02}),
+    "4 worlds, multiplier <= 2": (4, 1, NORM | {"multiplier_max": 2.0}),
+    "4 worlds in 4 cohorts": (4, 4, NORM),
+    "4 worlds, log std -1": (4, 1, NORM | {"log_std_init": -1.0}),
+    "4 worlds, lr 1e-3": (4, 1, NORM | {"policy_lr": 1e-3, "value_lr": 3e-3}),
+    "4 worlds, lambda 0.95": (
+        4,
+        1,
+        NORM | {"gae_lambda": 0.95, "cost_gae_lambda": 0.95},
+    ),
+    "2 worlds, KL 0.02": (2, 1, NORM | {"target_kl": 0.02}),
+}
+
+
+def config_of(name: str, steps: int = STEPS, episode: int = 1000) -> TableConfig:
+    """The table that one setting trains."""
+    worlds, segments, changes = SETTINGS[name]
+    train = TrainConfig(
+        env=EnvConfig(physics="closed_form", num_steps=episode),
+        agent=AgentConfig(**(BASE | changes)),
+        num_worlds=worlds,
+        segments_per_episode=segments,
+        num_epochs=max(1, steps // (worlds * episode)),
+    )
+    methods = tuple(
+        Method(f"{algorithm} {cost}", algorithm, cost)
+        for algorithm in ("ppo_lagrangian", "cpo")
+        for cost in COSTS
+    )
+    return TableConfig(train=train, methods=methods, seeds=SEEDS)
+
+
+def run_one(name: str, out: Path, smoke: bool) -> None:
+    """Train and score one setting; writes NAME.json."""
+    config = config_of(name, 1600, 200) if smoke else config_of(name)
+    devices = use_devices(None)
+    train = config.train
+    env = make_env(train.env)
+    agents = make_agents(config.algorithms, train, env)
+    population = make_population(env, agents, train, devices=devices)
+    slots = table_slots(config)
+    learners = population.init(slots)
+    start = time.monotonic()
+    for epoch in range(train.num_epochs):
+        learners, metrics = population.chunk(learners, slots, epoch)
+        if epoch == 0:
+            jax.block_until_ready(metrics)
+            start = time.monotonic()
+    jax.block_until_ready(metrics)
+    seconds = time.monotonic() - start
+    score = jax.jit(
+        jax.vmap(
+            lambda state, key: evaluate(env, agents[0], state, key, EPISODES),
+            in_axes=(0, None),
+        )
+    )
+    template = agents[0].init(jax.random.key(0))
+    rows = []
+    for algorithm, learner in zip(config.algorithms, learners, strict=True):
+        group = config.group(algorithm)
+        acting = actor(jax.device_get(learner.agent))
+        states = jax.tree.map(lambda x, n=len(group): np.stack([x] * n), template)
+        result = score(states.replace(**acting._asdict()), jax.random.key(99))
+        for index, (method, seed) in enumerate(group):
+            rows.append(
+                {
+                    "algorithm": algorithm,
+                    "cost": method.cost,
+                    "seed": seed,
+                    "return": float(result.ep_return[index].mean()),
+                    "ep_cost": float(result.ep_cost[index].mean()),
+                    "violation_rate": float(result.violation_rate[index]),
+                }
+            )
+    done = {"setting": name, "epochs": train.num_epochs, "seconds": seconds}
+    done |= {"agent": dataclasses.asdict(train.agent), "worlds": train.num_worlds}
+    done |= {"segments": train.segments_per_episode, "rows": rows, "facts": run_facts()}
+    text = json.dumps(done, indent=1, default=str)
+    (out / f"{name.replace(' ', '_')}.json").write_text(text)
+    print(f"{name}: {seconds:.0f} s", flush=True)
+
+
+def run_all(names: list[str], out: Path, smoke: bool) -> None:
+    """All settings at once on a GPU, one after the other on a CPU."""
+    is_gpu = Path("/dev/nvidia0").exists()
+    environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    running = []
+    for name in names:
+        command = [sys.executable, __file__, "run", "--only", name, "--out", str(out)]
+        command += ["--smoke"] if smoke else []
+        process = subprocess.Popen(command, env=environment)
+        running.append(process)
+        if not is_gpu:
+            process.wait()
+    failed = [p.args for p in running if p.wait()]
+    if failed:
+        raise SystemExit(f"{len(failed)} settings failed: {failed}")
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=("run", "collect"))
+    parser.add_argument("--only", nargs="+", choices=SETTINGS, default=list(SETTINGS))
+    parser.add_argument("--out", type=Path, default=Path("runs/learners"))
+    parser.add_argument("--smoke", action="store_true")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    if len(args.only) == 1:
+        run_one(args.only[0], args.out, args.smoke)
+    else:
+        run_all(args.only, args.out, args.smoke)
+
+
+if __name__ == "__main__":
+    main()
