@@ -57,11 +57,11 @@ class Size(NamedTuple):
       episodes: of the truth's evaluation, a seed.
     """
 
-    graded: int = 50
-    normal: int = 12
+    graded: int = 40
+    normal: int = 6
     seeds: int = 5
-    truth: int = 250
-    short: int = 96
+    truth: int = 500
+    short: int = 128
     warm: int = 64
     episodes: int = 200
 
@@ -102,15 +102,23 @@ def make_slots(theta: np.ndarray, size: Size, first_seed: int) -> tuple[Slot, ..
 
 
 def train(
-    population: Population, learners: Any, slots: Any, epochs: int, what: str
+    population: Population,
+    learners: Any,
+    slots: Any,
+    epochs: int,
+    what: str,
+    seconds: float = np.inf,
 ) -> tuple[Any, dict[str, np.ndarray]]:
-    """Learners after so many epochs, and `KEPT` metrics [E, A, C * S]."""
+    """Learners after so many epochs or seconds, and `KEPT` metrics [E, A, C * S]."""
     rows, start = [], time.monotonic()
     for epoch in range(epochs):
+        if time.monotonic() - start > seconds:
+            print(f"{what}: stopped after {epoch} epochs", flush=True)
+            break
         learners, metrics = population.chunk(learners, slots, epoch)
         rows.append([{name: group[name][0] for name in KEPT} for group in metrics])
+        jax.block_until_ready(metrics)
         if epoch % 16 == 0:
-            jax.block_until_ready(metrics)
             print(f"{what} {epoch}: {time.monotonic() - start:.0f} s", flush=True)
     rows = jax.device_get(rows)
     kept = {name: np.asarray([[g[name] for g in r] for r in rows]) for name in KEPT}
@@ -131,8 +139,9 @@ def warm_start(population: Population, learners: Any, slots: Any, size: Size) ->
     return tuple(groups)
 
 
-def run(path: Path, size: Size, config: TrainConfig) -> None:
-    """All three trainings and the evaluation, into one npz."""
+def run(path: Path, size: Size, config: TrainConfig, seconds: float) -> None:
+    """All three trainings and the evaluation, into one npz, in about `seconds`."""
+    begin = time.monotonic()
     env = make_env(config.env)
     agents = make_agents(ALGORITHMS, config, env)
     population = make_population(env, agents, config, devices=jax.devices())
@@ -155,10 +164,12 @@ def run(path: Path, size: Size, config: TrainConfig) -> None:
     learners, metrics = train(population, learners, slots, size.warm, "warm")
     keep("warm", metrics)
     slots = make_slots(theta, size, 0)
+    left = seconds - (time.monotonic() - begin)
     learners, metrics = train(
-        population, population.init(slots), slots, size.truth, "truth"
+        population, population.init(slots), slots, size.truth, "truth", left
     )
     keep("truth", metrics)
+    print("evaluating", flush=True)
 
     score = jax.jit(
         jax.vmap(
@@ -190,6 +201,7 @@ def main() -> None:
     parser.add_argument("part", choices=("run", "collect"))
     parser.add_argument("--out", type=Path, default=Path("runs/fitness"))
     parser.add_argument("--smoke", action="store_true")
+    parser.add_argument("--seconds", type=float, default=np.inf)
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     use_devices(None)
@@ -198,7 +210,7 @@ def main() -> None:
     if args.smoke:
         env = EnvConfig(physics="closed_form", num_steps=100)
     config = TrainConfig(env=env, agent=config.agent, num_worlds=config.num_worlds, num_epochs=1)
-    run(args.out, SMOKE if args.smoke else Size(), config)
+    run(args.out, SMOKE if args.smoke else Size(), config, args.seconds)
 
 
 if __name__ == "__main__":

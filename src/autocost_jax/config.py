@@ -302,7 +302,7 @@ _LAPTOP_AGENT = AgentConfig(
 PRESETS: dict[str, SearchConfig] = {
     "laptop": SearchConfig(
         train=TrainConfig(
-            agent=_LAPTOP_AGENT, num_worlds=8, num_epochs=27, chunk_epochs=1
+            agent=_LAPTOP_AGENT, num_worlds=4, num_epochs=27, chunk_epochs=1
         ),
         population_size=8,
         num_elites=2,

@@ -21,8 +21,9 @@ from autocost_jax.costs import HIDDEN, intrinsic_logit
 from autocost_jax.records import Key
 
 QUIET_COST = 1e-4  # of a `monotone_start` at a typical place, or a `graded_start`
-QUIET_PLACES = (10.0, 50.0)  # percentiles; where a `graded_start` is quiet
-LOUD_COSTS = (0.01, 0.5)  # of a `graded_start` at the 70th percentile
+QUIET_PLACES = (10.0, 75.0)  # percentiles; where a `graded_start` is quiet
+LOUD_PLACE = 85.0  # percentile at which its loudness is set
+LOUD_COSTS = (0.01, 0.5)  # how loud it is there
 
 
 class Fitness(struct.PyTreeNode):
@@ -223,8 +224,8 @@ def graded_start(
 
     As `monotone_start`, but each hidden unit turns on where one of the typical places
     has its readings, and the output layer is scaled so that over all of them the cost
-    is 1e-4 at a percentile uniform in [10, 50] and log-uniform in [0.01, 0.5] at the
-    70th: most of a `monotone_start` is silent everywhere or so loud that agents flee,
+    is 1e-4 at a percentile uniform in [10, 75] and log-uniform in [0.01, 0.5] at the
+    85th: most of a `monotone_start` is silent everywhere or so loud that agents flee,
     whatever its shape.
 
     Args:
@@ -247,7 +248,7 @@ def graded_start(
         key_quiet, (num,), minval=QUIET_PLACES[0], maxval=QUIET_PLACES[1]
     )
     low = jax.vmap(jnp.percentile)(logits, quiet)
-    high = jnp.percentile(logits, 70, axis=1)
+    high = jnp.percentile(logits, LOUD_PLACE, axis=1)
     low_level, high_level = (jnp.log(cost) for cost in LOUD_COSTS)
     level = jax.random.uniform(key_level, (num,), minval=low_level, maxval=high_level)
     contrast = jnp.maximum(high - low, 0.01 * outer.sum(1))  # units may be all but off
