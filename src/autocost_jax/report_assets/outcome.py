@@ -15,7 +15,8 @@ OFTEN = 0.05  # of the steps; agents that drive past the border now and then sta
 def verdict(data: ReportData) -> str:
     """What came out of the search, in words."""
     text = data.conclusion or _from_stages(data)
-    return text if data.can_violate else f"{TOO_SHORT} {text}"
+    warned = data.can_violate or "too short" in text
+    return text if warned else f"{TOO_SHORT} {text}"
 
 
 def candidate_name(stage: int, index: int) -> str:

@@ -34,9 +34,10 @@ _PLAYER = """<div class="player"><div class="panes{{one}}" id="panes">{{panes}}<
 <label>View <select id="view">{{views}}</select></label>
 <label>Speed <select id="speed">{{speeds}}</select></label>
 <label><input id="show-lidar" type="checkbox" checked> lidar</label>
-<label><input id="show-trail" type="checkbox" checked> trail</label>
-<span class="hint">drag turns, Ctrl + wheel zooms; space, arrows</span></div>
+<label><input id="show-trail" type="checkbox" checked> trail</label></div>
 <ul class="key">{{key}}</ul>
+<p class="hint">Drag turns the view, Ctrl + wheel zooms; in a focused view the space bar
+plays, and the arrows go step by step.</p>
 <noscript><p>The replay needs JavaScript.</p></noscript></div>"""
 
 _PANE = """<div class="card pane" id="pane-{{i}}"><div class="pick">{{pick}}</div>
@@ -67,10 +68,8 @@ def replay_summary(replay: Replay) -> str:
     """Length, return, cost and time outside the arena, in one plain sentence."""
     cost, reward = (float(np.nansum(x)) for x in (replay.cost, replay.reward))
     hits = int(np.nansum(replay.violations))
-    text = (
-        f"One episode of {replay.steps} steps; return {number(reward)}, extrinsic cost "
-        f"{number(cost)} in {hits} steps"
-    )
+    text = f"One episode of {replay.steps} steps; return {number(reward)}, "
+    text += f"extrinsic cost {number(cost)} in {hits} steps" if hits else "no violation"
     outside = outside_share(replay)
     if outside > 0:
         text += f"; {percent(outside)} of the time outside the arena"
@@ -158,7 +157,7 @@ def _key(replays: Sequence[Replay]) -> str:
     entries = [
         *((f"var(--{look})", THINGS[look]) for look in THINGS if look in looks),
         (None, f"rings around the robot: what its lidars read ({_rings(replays[0])})"),
-        ("var(--ink)", "dark line on the floor: border of the arena; no wall"),
+        ("var(--ink)", "thick line on the floor: border of the arena, not a wall"),
         ("var(--limit)", "violation: red frame, trail, bar; line: cost so far"),
         ("var(--best)", "line in the chart: return so far"),
     ]

@@ -80,9 +80,32 @@ def best_section(data: ReportData) -> str:
     }
     panels = heat_panels(best.theta, data.obstacle_radius, name)
     name_of_best = candidate_name(best.stage, best.index)
-    where = f"{name_of_best[0].upper()}{name_of_best[1:]}: {best.label}."
+    where = f"{name_of_best[0].upper()}{name_of_best[1:]}"
+    # A label may speak of zero violations, which short episodes do not show.
+    where += f": {best.label}." if data.can_violate else "."
     drawn = figures("best", panels, notes, _card(data))
-    return section("best", "The best cost", escape(where), drawn)
+    verdict = f'<div class="diagnosis">{_list(_diagnosis(data))}</div>'
+    return section("best", "The best cost", escape(where), verdict, drawn)
+
+
+def _diagnosis(data: ReportData) -> list[str]:
+    """What is wrong with the best cost."""
+    best = data.best
+    if best is None:
+        return []
+    stage = data.stages[best.stage]
+    far, near = (
+        np.nan if values is None else float(values[best.index])
+        for values in (stage.far_cost, stage.near_cost)
+    )
+    return describe_cost(
+        best.theta,
+        data.obstacle_radius,
+        far,
+        near,
+        obstacle=data.obstacle,
+        heading=_heading(data),
+    )
 
 
 def _facing(data: ReportData) -> str:
@@ -96,23 +119,11 @@ def _heading(data: ReportData) -> float:
 
 
 def _card(data: ReportData) -> str:
-    """What is wrong with the best cost, its scores and its parameters."""
+    """The best cost's scores and parameters."""
     best = data.best
     if best is None:
         return ""
     stage = data.stages[best.stage]
-    far, near = (
-        np.nan if values is None else float(values[best.index])
-        for values in (stage.far_cost, stage.near_cost)
-    )
-    faults = describe_cost(
-        best.theta,
-        data.obstacle_radius,
-        far,
-        near,
-        obstacle=data.obstacle,
-        heading=_heading(data),
-    )
     scores = (
         f"return at the end of its stage: {number(stage.ep_return[best.index])}",
         f"extrinsic cost there: {number(stage.cost[best.index])}",
@@ -122,8 +133,7 @@ def _card(data: ReportData) -> str:
         for i in range(0, len(best.theta), 4)
     )
     return (
-        f'<div class="card"><h3>How it sounds</h3>{_list(faults)}'
-        f"<h3>Its card</h3>{_list((*scores, *best.card))}"
+        f'<div class="card"><h3>Its card</h3>{_list((*scores, *best.card))}'
         f"<details><summary>Its {len(best.theta)} parameters</summary><p>W1 (rows of "
         f"4), b1, W2, b2:</p><pre>{escape(theta)}</pre></details></div>"
     )

@@ -88,11 +88,6 @@ def _draw(axes: "Axes", data: ReportData, row: int) -> None:
     # The ends of the map would vanish on a white or a black page.
     shades = colormaps["viridis"](np.linspace(0.15, 0.92, max(count, 2))[:count])
     colours, bounds = ListedColormap(shades), np.arange(count + 1) + 0.5
-    best = front(rate, ep_return)
-    axes.step(
-        rate[best], ep_return[best], where="post", color=MUTED, lw=1.4, zorder=2,
-        label="best trade-offs",
-    )  # fmt: skip
     dots = axes.scatter(
         rate, ep_return, c=stage + 1, cmap=colours, s=30, edgecolors=MUTED,
         linewidths=0.6, norm=BoundaryNorm(bounds, count) if count > 1 else None,
@@ -111,9 +106,24 @@ def _draw(axes: "Axes", data: ReportData, row: int) -> None:
     axes.margins(x=0.06, y=0.1)
     low, high = axes.get_xlim()
     axes.set_xlim(min(low, -0.4), min(max(high, LEAST_SPAN), 104))
+    _draw_front(axes, rate, ep_return)
     legend(axes, 2)
     name = NAMES.get(data.algorithms[row], data.algorithms[row]).replace("$", r"\$")
     label_axes(axes, "violating episodes, %", f"{name}: return per episode")
+
+
+def _draw_front(axes: "Axes", rate: Array, ep_return: Array) -> None:
+    """Steps through the best trade-offs; what is below and to the right is beaten."""
+    best = front(rate, ep_return)
+    if not best.size:
+        return
+    (_, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    x = np.concatenate([rate[best[:1]], rate[best], [right]])
+    y = np.concatenate([[bottom], ep_return[best], ep_return[best[-1:]]])
+    axes.step(
+        x, y, where="post", color=MUTED, lw=1.3, zorder=2, label="best trade-offs"
+    )
+    axes.set_ylim(bottom, top)
 
 
 def _draw_chosen(axes: "Axes", data: ReportData, row: int) -> None:
@@ -143,5 +153,11 @@ def _draw_references(axes: "Axes", data: ReportData, row: int) -> None:
         axes.plot(
             x[known], y[known], marker, linestyle="none", markersize=7, zorder=4,
             markerfacecolor=INK, markeredgecolor=PAPER, markeredgewidth=0.8,
-            label=COST_NAMES[cost],
+        )  # fmt: skip
+        at = int(np.nanargmax(np.where(known, y, -np.inf)))
+        left = x[at] > 0.5 * axes.get_xlim()[1]  # of its mark, if that is on the right
+        axes.annotate(
+            COST_NAMES[cost], (x[at], y[at]), (-7 if left else 7, 3),
+            textcoords="offset points", ha="right" if left else "left", fontsize=8.5,
+            color=INK, zorder=6,
         )  # fmt: skip
