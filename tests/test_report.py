@@ -448,7 +448,7 @@ def nearest_theta():
     ],
 )
 def test_what_is_wrong_with_a_cost(theta, far, near, words):
-    text = " ".join(describe_cost(theta, 0.3, far, near))
+    text = " ".join(describe_cost(theta, 0.3, far, near, heading=0.0))
     for word in words:
         assert word in text
     for fault in ("One-sided", "Loud everywhere", "Silent", "Quiet far"):
@@ -459,7 +459,8 @@ def test_what_is_wrong_with_a_cost(theta, far, near, words):
 def test_sides_turn_with_the_robots_heading():
     """A Car drives along -y of its frame: its x axis points to the driver's left."""
     theta = one_sided_theta((7, 0))
-    loud, quiet = side_costs(theta, 0.45)
+    assert side_costs(theta, 0.45)[0][1] == "towards +x of its frame"
+    loud, quiet = side_costs(theta, 0.45, 0.0)
     assert loud[1] == "ahead of it"
     assert quiet[0] < 0.2 * loud[0]
     turned, _ = side_costs(theta, 0.45, -np.pi / 2)

@@ -16,6 +16,7 @@ QUIET_SIDE = 0.5
 SIDE_DISTANCE = 1.5  # radii: where the sides are compared, the rim of "near"
 BEARINGS, QUARTER = 144, 36  # bearings around the robot; those of a 90-degree side
 SIDES = ("ahead of it", "on its left", "behind it", "on its right")
+AXES = tuple(f"towards {axis} of its frame" for axis in ("+x", "+y", "−x", "−y"))
 
 
 def describe_cost(
@@ -25,7 +26,7 @@ def describe_cost(
     near: float,
     *,
     obstacle: str = "hazard",
-    heading: float = 0.0,
+    heading: float | None = None,
 ) -> list[str]:
     """Sentences that name the faults of a cost, or say that it has none of these.
 
@@ -35,7 +36,8 @@ def describe_cost(
       far: mean cost per step over visited states more than 3 radii away; NaN: unknown.
       near: the same closer than 1.5 radii.
       obstacle: what to call it.
-      heading: direction that is ahead in the robot's frame, radians from its x axis.
+      heading: direction that is ahead in the robot's frame, radians from its x axis;
+        None: unknown, sides are named by axes.
     """
     sentences = []
     loud, quiet = side_costs(theta, SIDE_DISTANCE * radius, heading)
@@ -70,7 +72,7 @@ def describe_cost(
 
 
 def side_costs(
-    theta: Array, distance: float, heading: float = 0.0
+    theta: Array, distance: float, heading: float | None = None
 ) -> tuple[tuple[float, str], tuple[float, str]]:
     """The loudest and the quietest side of the robot, as (mean cost, side in words).
 
@@ -80,11 +82,13 @@ def side_costs(
     Args:
       theta: [D] parameters of the network.
       distance: of a single obstacle's centre, metres.
-      heading: direction that is ahead in the robot's frame, radians from its x axis.
+      heading: direction that is ahead in the robot's frame, radians from its x axis;
+        None: unknown, sides are named by axes.
     """
-    bearing = heading + 2 * np.pi * (np.arange(BEARINGS) + 0.5) / BEARINGS
+    start, names = (0.0, AXES) if heading is None else (heading, SIDES)
+    bearing = start + 2 * np.pi * (np.arange(BEARINGS) + 0.5) / BEARINGS
     ego = distance * np.stack([np.cos(bearing), np.sin(bearing)], -1)
     cost = np.roll(network_cost(theta, object_lidar(ego)), QUARTER // 2)
     means = cost.reshape(len(SIDES), QUARTER).mean(1)
     loud, quiet = int(np.argmax(means)), int(np.argmin(means))
-    return (float(means[loud]), SIDES[loud]), (float(means[quiet]), SIDES[quiet])
+    return (float(means[loud]), names[loud]), (float(means[quiet]), names[quiet])

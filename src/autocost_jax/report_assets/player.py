@@ -219,12 +219,13 @@ def comparison_page(replays: Sequence[Replay], title: str, text: str) -> str:
 
 
 def _page(title: str, kicker: str, top: str, replays: Sequence[Replay]) -> str:
+    heading = "Replays" if len(replays) > 1 else "Replay"
     parts = {
         "title": escape(title),
         "style": asset("page.css"),
         "kicker": escape(kicker),
         "top": top,
-        "replay": section("replay", "Replay", "", replay_panel(replays)),
+        "replay": section("replay", heading, "", replay_panel(replays)),
         "data": replay_data(replays),
         "script": replay_script(),
     }

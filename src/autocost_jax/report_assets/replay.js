@@ -40,19 +40,21 @@
     const shapes = data.shapes.map((shape) => ({ ...shape, axes: axes(shape.quat) }));
     const record = { ...data, ...numbers, total, lidars, pose, path, boxPath, outside, timeOutside, moves, shapes, last, frameTime: data.dt * data.stride };
     record.reach = robotReach(record);
-    record.all = bounds(record);
+    record.seen = bounds(record);
+    record.all = record.seen[last];
     return record;
   }
 
   function beyond([x, y], [x0, y0, x1, y1]) { return Math.hypot(Math.max(x0 - x, 0, x - x1), Math.max(y0 - y, 0, y - y1)); }
 
-  function bounds(record) { // what a view of everything must hold: the arena, and all paths
+  function bounds(record) { // by frame, what a view must hold: the arena, and all paths so far
     const [x0, y0, x1, y1] = record.extents, low = [x0, y0], high = [x1, y1];
-    for (const p of record.path.concat(record.boxPath || [])) {
-      if (!p) continue;
-      for (const i of [0, 1]) { low[i] = Math.min(low[i], p[i]); high[i] = Math.max(high[i], p[i]); }
-    }
-    return { low, high, x: (low[0] + high[0]) / 2, y: (low[1] + high[1]) / 2, half: Math.max(high[0] - low[0], high[1] - low[1]) / 2 + 0.35 };
+    return record.path.map((robot, t) => {
+      for (const p of [robot, record.boxPath && record.boxPath[t]]) {
+        if (p) for (const i of [0, 1]) { low[i] = Math.min(low[i], p[i]); high[i] = Math.max(high[i], p[i]); }
+      }
+      return { low: [...low], high: [...high], x: (low[0] + high[0]) / 2, y: (low[1] + high[1]) / 2, half: Math.max(high[0] - low[0], high[1] - low[1]) / 2 + 0.35 };
+    });
   }
 
   function robotReach(record) { // how far the robot reaches from its origin, from above
@@ -417,11 +419,11 @@
       for (const job of jobs.sort((p, q) => q.key - p.key)) job.draw();
     }
 
-    function hides(eye, thing, robot) { // whether a pillar stands between the eye and the robot
-      if (eye.flat || !robot || thing.look !== "pillars") return false;
+    function hides(eye, thing, robot) { // whether a pillar or a box stands between the eye and the robot
+      if (eye.flat || !robot || (thing.look !== "pillars" && thing.look !== "box")) return false;
       const [x, y] = [robot[0] - eye.eye[0], robot[1] - eye.eye[1]], [u, v] = [thing.p[0] - eye.eye[0], thing.p[1] - eye.eye[1]];
       const norm = Math.hypot(x, y), share = (u * x + v * y) / norm ** 2;
-      return share > 0 && share < 1 && Math.abs(u * y - v * x) / norm < thing.solids[0].size[0] + 0.1;
+      return share > 0 && share < 1 && Math.abs(u * y - v * x) / norm < footprint(thing.solids[0]) + 0.1;
     }
 
     function footprint(s) {
@@ -448,7 +450,7 @@
 
     function drawMap(pen, all, robot, width, height) { // a small map in a corner: where in the arena this is
       const { palette } = shared, side = Math.max(84, Math.min(150, 0.3 * Math.min(width, height))), left = width - side - 12, top = 12;
-      const scale = side / (2 * record.all.half), to = ([x, y]) => [left + side / 2 + (x - record.all.x) * scale, top + side / 2 - (y - record.all.y) * scale];
+      const seen = record.seen[frame], scale = side / (2 * seen.half), to = ([x, y]) => [left + side / 2 + (x - seen.x) * scale, top + side / 2 - (y - seen.y) * scale];
       const dot = (p, r, fill, alpha) => { const [x, y] = to(p); pen.globalAlpha = alpha; pen.fillStyle = fill; pen.beginPath(); pen.arc(x, y, Math.max(1.5, r * scale), 0, 2 * Math.PI); pen.fill(); pen.globalAlpha = 1; };
       pen.save();
       pen.globalAlpha = 0.9; pen.fillStyle = palette.card; pen.fillRect(left, top, side, side); pen.globalAlpha = 1;

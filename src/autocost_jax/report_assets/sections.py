@@ -68,9 +68,8 @@ def best_section(data: ReportData) -> str:
         "map": (
             f"Heat map of the best intrinsic cost over robot positions around a {name} "
             "at the origin, which is drawn as a circle.",
-            f"The robot's place; it faces {_facing(data)} everywhere. A single {name} "
-            "(circle) stands at the origin. Lidar of 8 bins, exponential, gain 1. The "
-            "scale starts at 0.",
+            f"The robot's place; {_facing(data)}. A single {name} (circle) stands at "
+            "the origin. Lidar of 8 bins, exponential, gain 1. The scale starts at 0.",
         ),
         "profile": (
             f"The same cost against the distance to the {name}'s centre.",
@@ -109,13 +108,17 @@ def _diagnosis(data: ReportData) -> list[str]:
 
 
 def _facing(data: ReportData) -> str:
-    """The direction that is ahead in the robot's frame, as an axis of the map."""
-    quarter = round(_heading(data) / (np.pi / 2)) % 4
-    return ("+x", "+y", "−x", "−y")[quarter]
+    """How the robot stands in the map."""
+    heading = _heading(data)
+    if heading is None:
+        return "its x axis points along +x everywhere"
+    quarter = round(heading / (np.pi / 2)) % 4
+    return f"it faces {('+x', '+y', '−x', '−y')[quarter]} everywhere"
 
 
-def _heading(data: ReportData) -> float:
-    return data.replays[0].heading if data.replays else 0.0
+def _heading(data: ReportData) -> float | None:
+    """What is ahead in the robot's frame, as `Replay.heading`; None if unknown."""
+    return data.replays[0].heading if data.replays else None
 
 
 def _card(data: ReportData) -> str:
