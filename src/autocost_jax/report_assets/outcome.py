@@ -86,7 +86,7 @@ def outcome_section(data: ReportData) -> str:
         "A green bar marks a cost under which nobody violated."
     )
     notes = "".join(f"<p>{escape(text)}</p>" for text in _outside_notes(data))
-    body = table(caption, head, rows, clean)
+    body = table(caption, head, rows, clean, "compact")
     lead = "Agents trained afresh with each cost, then judged in new episodes."
     return section("outcome", "Did it succeed?", lead, body, notes)
 
@@ -140,8 +140,8 @@ def tradeoff_section(data: ReportData) -> str:
     told = ""
     if count:
         told = (
-            " The black marks were trained beside them with costs that nobody evolved: "
-            "a search that succeeds gets above and to the left of them."
+            " The squares and triangles were trained beside them with costs that "
+            "nobody evolved: a search that succeeds gets above and to the left of them."
         )
     lead = (
         "Every dot is an agent at the end of its training, under one candidate's cost."
