@@ -145,8 +145,8 @@ def test_the_report_is_made_of_the_run(whole):
     out, _ = whole
     data = load_report(out)
     assert len(data.stages) == 2
-    assert data.replay is not None
-    assert {row.episodes for row in data.evaluations} == {4}
+    assert len(data.replays) == 1
+    assert {row.episodes for row in data.summary} == {4}
     page = (out / "report" / "index.html").read_text()
     assert "Goal-Hazard-Point" in page
 

@@ -60,7 +60,7 @@ def use(text, tmp_path):
 
 def sum_of(text, name):
     """The sum of one of the page's arrays."""
-    data = json.loads(check_page(text).blocks[0])
+    (data,) = json.loads(check_page(text).blocks[0])
     return np.frombuffer(base64.b64decode(data[name]), "<f4").sum()
 
 
@@ -69,33 +69,33 @@ def test_the_page_is_self_contained(replayed):
     page = check_page(text)
     assert page.title.startswith("Goal-Hazard-Point, seek")
     assert len(text) < 200_000
-    for name in ("world", "timeline", "scrub", "view", "speed", "now-return"):
+    for name in ("world-0", "timeline-0", "scrub", "view", "speed", "now-return-0"):
         assert name in page.ids
-    assert "now-intrinsic" not in page.ids
+    assert "now-intrinsic-0" not in page.ids
 
 
 def test_the_page_can_be_used(replayed, tmp_path):
     text = replayed.read_text()
     notes = use(text, tmp_path)
-    assert notes["start"]["step"] == f"0 of {STEPS}"
-    assert notes["start"]["view"] == "3d"
+    assert notes["start"]["step"] == f"step 0 of {STEPS}"
+    assert notes["start"]["view"] == "follow"
     assert notes["slider"]["frame"] == 30
     assert notes["slider"]["time"] == "0.6 s"
-    for view in ("top", "follow", "3d"):
+    for view in ("top", "3d", "follow"):
         assert notes[view]["view"] == view
     assert notes["key"]["frame"] == 31
     assert notes["played"]["frame"] > 31
-    assert notes["end"]["step"] == f"{STEPS} of {STEPS}"
+    assert notes["end"]["step"] == f"step {STEPS} of {STEPS}"
     assert notes["end"]["return"] == pytest.approx(sum_of(text, "reward"), abs=0.006)
     for note in notes.values():
         assert note["colours"] > 20  # shaded solids on a tiled floor, not a blank
-    assert notes["bare"]["colours"] != notes["3d"]["colours"]
+    assert notes["bare"]["colours"] != notes["follow"]["colours"]
 
 
 def test_the_address_chooses_moment_and_view(replayed, tmp_path):
     dom, log = browse(tmp_path, replayed, address="#step=25&view=top")
-    assert re.search(r'id="now-step">25 of 60<', dom)
-    assert re.search(r'<canvas id="world"[^>]*data-view="top"', dom)
+    assert re.search(r'id="now-step">step 25 of 60<', dom)
+    assert re.search(r'id="world-0"[^>]*data-view="top"', dom)
     assert "CONSOLE" not in log
 
 
@@ -103,7 +103,7 @@ def test_a_page_by_itself_plays(replayed, tmp_path):
     for seconds in (4, 16, 64):  # on a busy machine the page is slow to begin
         budget = f"--virtual-time-budget={1000 * seconds}"
         dom, _ = browse(tmp_path, replayed, budget, address="")
-        frame = re.search(r'<canvas id="world"[^>]*data-frame="(\d+)"', dom)
+        frame = re.search(r'id="world-0"[^>]*data-frame="(\d+)"', dom)
         assert frame is not None
         if int(frame.group(1)) > 5:
             return

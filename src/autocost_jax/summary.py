@@ -14,11 +14,12 @@ from autocost_jax.evolution import pick_label
 from autocost_jax.report import (
     BestCandidate,
     Curve,
-    Evaluation,
     ReportData,
     StageRecord,
+    SummaryRow,
     network_cost,
 )
+from autocost_jax.report_assets.data import NAMES
 from autocost_jax.report_assets.replay import Replay
 from autocost_jax.scene import Recording, make_replay
 from autocost_jax.store import list_stages, read_config, read_metrics
@@ -46,11 +47,16 @@ def load_report(path: str | Path) -> ReportData:
         stages=stages,
         best=_best(config, stages, card),
         curves=tuple(_curves(config, rows)),
-        replay=_replay(path, config),
-        evaluations=tuple(
-            Evaluation(
-                label=f"{name}, best cost, fresh layouts",
-                **{k: v for k, v in row.items() if k != "distance_travelled"},
+        replays=_replays(path, config),
+        summary=tuple(
+            SummaryRow(
+                algorithm=name,
+                cost="best",
+                ep_return=row["return_mean"],
+                ep_cost=row["cost_mean"],
+                violation_rate=row["violation_rate"],
+                seeds=1,
+                episodes=row["episodes"],
             )
             for name, row in card.get("evaluation", {}).items()
         ),
@@ -86,7 +92,6 @@ def _stage_record(config: SearchConfig, arrays: dict[str, np.ndarray]) -> StageR
         elites=np.asarray([match[0] for match in parents]),
         far_cost=_known_mean(arrays["scores/intrinsic_far"]),
         near_cost=_known_mean(arrays["scores/intrinsic_near"]),
-        distance_travelled=arrays["scores/distance_travelled"],
     )
 
 
@@ -147,20 +152,21 @@ def _curves(config: SearchConfig, rows: list[dict[str, Any]]) -> list[Curve]:
     return curves
 
 
-def _replay(path: Path, config: SearchConfig) -> Replay | None:
+def _replays(path: Path, config: SearchConfig) -> tuple[Replay, ...]:
     file, cost = path / "replay.npz", path / "cost.npz"
     if not (file.exists() and cost.exists()):
-        return None
+        return ()
     arrays: dict[str, Any] = dict(load_arrays(file, None))
     if arrays.keys() != set(Recording._fields):
-        return None  # written by an earlier version, which kept no joint positions
+        return ()  # written by an earlier version, which kept no joint positions
     theta = load_arrays(cost, None)["theta"]
-    return make_replay(
+    replay = make_replay(
         config.train.env,
         Recording(**arrays),
         intrinsic=network_cost(theta, arrays["constraint_lidar"]),
-        label=f"{config.algorithms[0]} trained with the best cost, sampled actions",
+        label=f"{NAMES.get(config.algorithms[0], config.algorithms[0])}, best cost",
     )
+    return (replay,)
 
 
 def _config_lines(

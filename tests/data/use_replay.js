@@ -12,7 +12,7 @@
 
   async function note(what) {
     await wait(30); // drawing comes a little later
-    const world = byId("world"), colours = new Set();
+    const world = byId("world-0"), colours = new Set();
     copy.canvas.width = world.width;
     copy.canvas.height = world.height;
     copy.drawImage(world, 0, 0);
@@ -24,8 +24,8 @@
       view: world.dataset.view,
       step: byId("now-step").textContent,
       time: byId("now-time").textContent,
-      return: Number(byId("now-return").textContent),
-      cost: Number(byId("now-cost").textContent),
+      return: Number(byId("now-return-0").textContent),
+      cost: Number(byId("now-cost-0").textContent),
       colours: colours.size,
     });
   }
@@ -33,14 +33,14 @@
   await note("start");
   change("scrub", "input", "30");
   await note("slider");
-  for (const view of ["top", "follow", "3d"]) {
+  for (const view of ["top", "3d", "follow"]) {
     change("view", "change", view);
     await note(view);
   }
   byId("show-lidar").click();
   byId("show-trail").click();
   await note("bare");
-  byId("world").dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }));
+  byId("world-0").dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }));
   await note("key");
   byId("play").click();
   await wait(300);

@@ -1,7 +1,7 @@
 """What a report is made of: plain records, checked when they are made."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,13 @@ import numpy as np
 from autocost_jax.report_assets.cost_field import THETA_SIZES, Array
 from autocost_jax.report_assets.replay import Replay
 
-TIMID_DISTANCE = 1.0  # metres an episode; an agent below it hardly moves
+NAMES = {"ppo_lagrangian": "PPO-Lagrangian", "cpo": "CPO"}
+COST_NAMES = {  # what agents are compared on, in the order of the summary
+    "extrinsic": "extrinsic cost alone",
+    "safety_margin_3x": "3x margin by hand",
+    "best": "best cost found",
+}
+NAN = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +32,10 @@ class StageRecord:
       elites: [K] indices of the candidates that were selected, best first.
       far_cost: [P] mean intrinsic cost over visited states far from obstacles, or None.
       near_cost: [P] the same close to hazards, or None. NaN: no such state.
-      distance_travelled: [A, P] metres an episode, or None.
+      violation_rate: [A, P] share of the training episodes at the end of the stage
+        that had any extrinsic cost, or None.
+      outside_share: [A, P] share of the steps that the agents spend outside the
+        arena, or None.
     """
 
     theta: Array
@@ -38,7 +47,8 @@ class StageRecord:
     elites: Array
     far_cost: Array | None = None
     near_cost: Array | None = None
-    distance_travelled: Array | None = None
+    violation_rate: Array | None = None
+    outside_share: Array | None = None
 
     @property
     def finite(self) -> Array:
@@ -56,12 +66,16 @@ class StageRecord:
         return finite_mean(self.ep_return[self.finite])
 
     @property
-    def timid_share(self) -> float:
-        """Share of agents travelling less than `TIMID_DISTANCE`; NaN if unknown."""
-        if self.distance_travelled is None:
-            return float("nan")
-        known = np.isfinite(self.distance_travelled)
-        return finite_mean(self.distance_travelled[known] < TIMID_DISTANCE)
+    def mean_violation_rate(self) -> float:
+        """Mean share of violating episodes over the agents; NaN if unknown."""
+        return finite_mean(
+            np.nan if self.violation_rate is None else self.violation_rate
+        )
+
+    @property
+    def mean_outside_share(self) -> float:
+        """Mean share of the steps outside the arena; NaN if unknown."""
+        return finite_mean(np.nan if self.outside_share is None else self.outside_share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,26 +120,51 @@ class BestCandidate:
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """One row of the evaluation table.
+class SummaryRow:
+    """How one algorithm's agents do under one cost, on fresh seeds and episodes.
 
     Attributes:
-      label: policy and environment.
-      return_mean: mean return of an episode.
-      return_ci: half-width of its 95 % interval.
-      cost_mean: mean extrinsic cost of an episode.
-      cost_ci: half-width of its 95 % interval.
-      violation_rate: share of episodes with any extrinsic cost.
-      episodes: how many episodes were run.
+      algorithm: one of `ReportData.algorithms`.
+      cost: a key of `COST_NAMES`: extrinsic, safety_margin_3x or best.
+      ep_return: mean return of an episode; NaN here and below: unknown.
+      ep_cost: mean extrinsic cost of an episode.
+      violation_rate: share of the episodes with any extrinsic cost.
+      outside_share: share of the steps outside the arena.
+      seeds: how many agents were trained afresh; 0: unknown.
+      episodes: how many episodes each of them was given; 0: unknown.
     """
 
-    label: str
-    return_mean: float
-    return_ci: float
-    cost_mean: float
-    cost_ci: float
-    violation_rate: float
-    episodes: int
+    algorithm: str
+    cost: str
+    ep_return: float = NAN
+    ep_cost: float = NAN
+    violation_rate: float = NAN
+    outside_share: float = NAN
+    seeds: int = 0
+    episodes: int = 0
+
+
+@dataclass(frozen=True)
+class ReferenceScore:
+    """An agent trained beside a stage's candidates, with a cost that nobody evolved.
+
+    Attributes:
+      stage: index into `ReportData.stages`, from 0.
+      algorithm: one of `ReportData.algorithms`.
+      cost: extrinsic or safety_margin_3x.
+      ep_return: its return of an episode; NaN here and below: unknown.
+      ep_cost: its extrinsic cost of an episode.
+      violation_rate: share of its episodes with any extrinsic cost.
+      outside_share: share of its steps outside the arena.
+    """
+
+    stage: int
+    algorithm: str
+    cost: str
+    ep_return: float = NAN
+    ep_cost: float = NAN
+    violation_rate: float = NAN
+    outside_share: float = NAN
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +173,7 @@ class ReportData:
 
     Attributes:
       title: name of the run.
-      config: what to show about the run, in order; the tiles at the top use the
-        keys "env steps", "duration", "steps/s" and "device" if they are there.
+      config: what to show about the run, in order.
       algorithms: the A names, in the order of the [A, P] arrays.
       deterministic: whether the scored policies used the mean action.
       obstacle: what must be avoided, as a word in the singular: "hazard".
@@ -143,15 +181,17 @@ class ReportData:
       stages: the finished stages; empty while the first is running.
       best: the result, or None if no stage has a finite candidate.
       curves: learning curves, any order.
-      control_cost: [S] stage means of the extrinsic cost of a search whose
-        selection is random, or None.
-      control_return: [S] the same of the return, or None.
-      replay: an episode of the best policy, or None.
-      evaluations: rows of the evaluation table.
+      summary: how the best cost does beside the references, on fresh seeds; for each
+        algorithm in the order of `COST_NAMES`.
+      conclusion: whether the search succeeded and at which price, as a sentence; empty:
+        the page makes one of the stages.
+      references: agents trained beside the candidates.
+      replays: recorded episodes; a label says algorithm and cost: "CPO, best cost".
+      can_violate: False if episodes are too short for anyone to violate, so that no
+        violations mean nothing.
 
     Raises:
-      ValueError: if shapes disagree, an index does not exist, or the best
-        candidate's label contradicts its stage.
+      ValueError: if shapes disagree, or an index, algorithm or cost does not exist.
     """
 
     title: str
@@ -163,18 +203,31 @@ class ReportData:
     stages: tuple[StageRecord, ...] = ()
     best: BestCandidate | None = None
     curves: tuple[Curve, ...] = ()
-    control_cost: Array | None = None
-    control_return: Array | None = None
-    replay: Replay | None = None
-    evaluations: tuple[Evaluation, ...] = field(default=())
+    summary: tuple[SummaryRow, ...] = ()
+    conclusion: str = ""
+    references: tuple[ReferenceScore, ...] = ()
+    replays: tuple[Replay, ...] = ()
+    can_violate: bool = True
 
     def __post_init__(self) -> None:
         for number, stage in enumerate(self.stages):
             _check_stage(stage, len(self.algorithms), f"stages[{number}]")
         for number, curve in enumerate(self.curves):
             _check_curve(curve, self.algorithms, f"curves[{number}]")
+        for name in ("summary", "references"):
+            costs = tuple(COST_NAMES)[: 3 if name == "summary" else 2]
+            for number, row in enumerate(getattr(self, name)):
+                _check_name(
+                    row.algorithm, self.algorithms, f"{name}[{number}].algorithm"
+                )
+                _check_name(row.cost, costs, f"{name}[{number}].cost")
         if self.best is not None:
             _check_best(self.best, self.stages)
+
+
+def _check_name(value: str, known: tuple[str, ...], name: str) -> None:
+    if value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
 
 
 def _shape(value: Any, shape: tuple[int, ...], name: str) -> None:
@@ -192,18 +245,15 @@ def _check_stage(stage: StageRecord, algorithms: int, name: str) -> None:
     _shape(stage.theta, (size, width), f"{name}.theta")
     for key in ("ep_return", "zero_violation", "far_cost", "near_cost"):
         _shape(getattr(stage, key), (size,), f"{name}.{key}")
-    for key in ("algorithm_cost", "algorithm_return", "distance_travelled"):
+    by_algorithm = ("algorithm_cost", "algorithm_return", "violation_rate")
+    for key in (*by_algorithm, "outside_share"):
         _shape(getattr(stage, key), (algorithms, size), f"{name}.{key}")
     if np.any((stage.elites < 0) | (stage.elites >= size)):
         raise ValueError(f"{name}.elites must be in [0, {size}), got {stage.elites}")
 
 
 def _check_curve(curve: Curve, algorithms: tuple[str, ...], name: str) -> None:
-    if curve.algorithm not in algorithms:
-        raise ValueError(
-            f"{name}.algorithm must be one of {', '.join(algorithms)}, "
-            f"got {curve.algorithm!r}"
-        )
+    _check_name(curve.algorithm, algorithms, f"{name}.algorithm")
     shape = np.shape(curve.ep_return)
     if len(shape) != 2 or shape[0] != len(curve.epoch) or curve.stage < 0:
         raise ValueError(f"{name}.ep_return must be [E, P], got shape {shape}")
@@ -220,7 +270,7 @@ def _check_best(best: BestCandidate, stages: tuple[StageRecord, ...]) -> None:
         raise ValueError(f"best.index must be in [0, {len(zero)}), got {best.index}")
 
 
-def finite_mean(values: Array) -> float:
+def finite_mean(values: Any) -> float:
     """Mean of the finite values; NaN if there are none."""
     values = np.asarray(values, float)
     values = values[np.isfinite(values)]

@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from autocost_jax.report_assets.cost_field import Array, network_cost, object_lidar
-from autocost_jax.report_assets.data import TIMID_DISTANCE, ReportData, finite_mean
+from autocost_jax.report_assets.data import (
+    COST_NAMES,
+    NAMES,
+    ReportData,
+    finite_mean,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,7 +24,6 @@ if TYPE_CHECKING:
 INK, MUTED, GRID, PAPER = "#1c2430", "#5b6675", "#e3e7ec", "#fefefe"
 ZERO, BEST, MEAN, LIMIT = "#00815a", "#0b62a8", "#b84a06", "#b3261e"
 ALGORITHM_COLOURS = (BEST, MEAN, "#7a3f9d", "#4d5b1f")
-NAMES = {"ppo_lagrangian": "PPO-Lagrangian", "cpo": "CPO"}
 PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.3  # inches
 CURVE_POINTS = 60
 WIDE_COST = 20.0  # above it a cost axis is logarithmic beyond 1
@@ -27,13 +31,13 @@ Draw = Callable[["Axes"], Any]
 
 
 def stage_scatter(data: ReportData) -> "Figure":
-    """The paper's evolution figure, the returns, and the share of timid agents."""
-    return _row([draw for _, draw in stage_panels(data)])
+    """The paper's evolution figure, the returns, and the time outside the arena."""
+    return draw_row([draw for _, draw in stage_panels(data)])
 
 
 def learning_curves(data: ReportData) -> "Figure":
     """Return, extrinsic and total cost by epoch, consecutive stages along x."""
-    return _row([draw for _, draw in curve_panels(data)])
+    return draw_row([draw for _, draw in curve_panels(data)])
 
 
 def heat_map(theta: Array, radius: float, obstacle: str = "hazard") -> "Figure":
@@ -44,7 +48,7 @@ def heat_map(theta: Array, radius: float, obstacle: str = "hazard") -> "Figure":
       radius: of the obstacle, metres.
       obstacle: what to call it.
     """
-    return _row([draw for _, draw in heat_panels(theta, radius, obstacle)])
+    return draw_row([draw for _, draw in heat_panels(theta, radius, obstacle)])
 
 
 def stage_panels(data: ReportData) -> list[tuple[str, Draw]]:
@@ -53,8 +57,8 @@ def stage_panels(data: ReportData) -> list[tuple[str, Draw]]:
         ("cost", lambda axes: _draw_stage_cost(axes, data)),
         ("return", lambda axes: _draw_stage_return(axes, data)),
     ]
-    if any(np.isfinite(stage.timid_share) for stage in data.stages):
-        panels.append(("timid", lambda axes: _draw_timid(axes, data)))
+    if any(np.isfinite(stage.mean_outside_share) for stage in data.stages):
+        panels.append(("outside", lambda axes: _draw_outside(axes, data)))
     return panels
 
 
@@ -65,9 +69,9 @@ def curve_panels(data: ReportData) -> list[tuple[str, Draw]]:
         return field, lambda axes: _draw_curves(axes, data, field, label)
 
     return [
-        panel("ep_return", "return an episode"),
-        panel("ep_cost", "extrinsic cost an episode"),
-        panel("ep_total_cost", "total cost an episode"),
+        panel("ep_return", "return per episode"),
+        panel("ep_cost", "extrinsic cost per episode"),
+        panel("ep_total_cost", "total cost per episode"),
     ]
 
 
@@ -97,19 +101,22 @@ def add_axes(figure: "Figure", columns: int, number: int) -> "Axes":
     return axes
 
 
-def _row(draws: list[Draw]) -> "Figure":
+def draw_row(draws: list[Draw]) -> "Figure":
+    """A figure of panels side by side."""
     figure = make_figure(PANEL_WIDTH * len(draws), PANEL_HEIGHT)
     for number, draw in enumerate(draws, 1):
         draw(add_axes(figure, len(draws), number))
     return figure
 
 
-def _label(axes: "Axes", x: str, y: str) -> None:
+def label_axes(axes: "Axes", x: str, y: str) -> None:
+    """Names both axes in the report's style."""
     axes.set_xlabel(x, color=INK, fontsize=9)
     axes.set_ylabel(y, color=INK, fontsize=9)
 
 
-def _legend(axes: "Axes", columns: int = 3) -> None:
+def legend(axes: "Axes", columns: int = 3) -> None:
+    """A legend above the axes, if anything has a name."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         axes.legend(
@@ -146,12 +153,13 @@ def _spread(number: int, size: int) -> Array:
     return number + (np.linspace(-0.26, 0.26, size) if size > 1 else np.zeros(1))
 
 
-def _draw_dots(axes: "Axes", data: ReportData, field: str) -> None:
+def _draw_dots(axes: "Axes", data: ReportData, values_by_stage: list[Array]) -> None:
+    """A dot for each candidate; `values_by_stage` holds [P] arrays."""
     for number, stage in enumerate(data.stages, 1):
-        values, finite = getattr(stage, field), stage.finite
+        values, finite = values_by_stage[number - 1], stage.finite
         x = _spread(number, len(values))
         elite = np.isin(np.arange(len(values)), stage.elites)
-        zero = stage.zero_violation.astype(bool)
+        zero = stage.zero_violation.astype(bool) & data.can_violate
         for chosen, edge, face, width in (
             (~zero & ~elite, MUTED, PAPER, 0.8),
             (~zero & elite, INK, PAPER, 1.7),
@@ -172,11 +180,11 @@ def _draw_dots(axes: "Axes", data: ReportData, field: str) -> None:
 
 def _dot_legend(axes: "Axes", data: ReportData) -> None:
     """Adds the legend entries of the kinds of dots that occur."""
-    zero = any(stage.zero_violation.any() for stage in data.stages)
+    zero = any(stage.zero_violation.any() for stage in data.stages) & data.can_violate
     frozen = any(not stage.finite.all() for stage in data.stages)
     kinds = [("o", PAPER, MUTED, 0.8, "candidate"), ("o", PAPER, INK, 1.7, "selected")]
     if zero:
-        kinds.append(("o", ZERO, ZERO, 0.8, "zero violation"))
+        kinds.append(("o", ZERO, ZERO, 0.8, "no violation"))
     if frozen:
         kinds.append(("x", LIMIT, LIMIT, 1.2, "diverged"))
     for marker, face, edge, width, label in kinds:
@@ -186,10 +194,18 @@ def _dot_legend(axes: "Axes", data: ReportData) -> None:
         )  # fmt: skip
 
 
-def _control(axes: "Axes", values: Array | None) -> None:
-    if values is not None and len(values):
-        x = np.arange(1, len(values) + 1)
-        axes.plot(x, values, "--", color=MUTED, lw=1.4, label="random control, mean")
+def _reference(axes: "Axes", data: ReportData, field: str, scale: float = 1.0) -> None:
+    """A line through the stages' agents that had the extrinsic cost alone."""
+    rows = [row for row in data.references if row.cost == "extrinsic"]
+    stages = sorted({row.stage for row in rows if row.stage < len(data.stages)})
+    means = [
+        scale * finite_mean([getattr(row, field) for row in rows if row.stage == stage])
+        for stage in stages
+    ]
+    if np.isfinite(means).any():
+        x = np.array(stages) + 1
+        label = COST_NAMES["extrinsic"]
+        axes.plot(x, means, "s--", color=MUTED, lw=1.4, markersize=4, label=label)
 
 
 def _draw_stage_cost(axes: "Axes", data: ReportData) -> None:
@@ -198,16 +214,16 @@ def _draw_stage_cost(axes: "Axes", data: ReportData) -> None:
     best = [np.min(s.cost[s.finite], initial=np.inf) for s in stages]
     best = [value if np.isfinite(value) else np.nan for value in best]
     values = np.concatenate([s.cost[s.finite] for s in stages] or [np.zeros(0)])
-    label = _cost_axis(axes, values, "extrinsic cost an episode")
+    label = _cost_axis(axes, values, "extrinsic cost per episode")
     axes.axhline(0, color=LIMIT, lw=1.2, zorder=1)
-    _draw_dots(axes, data, "cost")
+    _draw_dots(axes, data, [s.cost for s in stages])
     axes.plot(x, [s.mean_cost for s in stages], color=MEAN, lw=2, label="mean")
     axes.plot(x, best, color=BEST, lw=2, label="lowest")
-    _control(axes, data.control_cost)
+    _reference(axes, data, "ep_cost")
     _dot_legend(axes, data)
-    _legend(axes)
+    legend(axes)
     _stage_ticks(axes, len(stages))
-    _label(axes, "stage", label)
+    label_axes(axes, "stage", label)
 
 
 def _draw_stage_return(axes: "Axes", data: ReportData) -> None:
@@ -217,30 +233,32 @@ def _draw_stage_return(axes: "Axes", data: ReportData) -> None:
     for stage in stages:
         chosen = np.isin(np.arange(len(stage.cost)), stage.elites) & stage.finite
         elite.append(np.mean(stage.ep_return[chosen]) if chosen.any() else np.nan)
-    _draw_dots(axes, data, "ep_return")
+    _draw_dots(axes, data, [s.ep_return for s in stages])
     axes.plot(x, [s.mean_return for s in stages], color=MEAN, lw=2, label="mean")
     axes.plot(x, elite, color=BEST, lw=2, label="mean of the selected")
-    _control(axes, data.control_return)
-    _legend(axes)
+    _reference(axes, data, "ep_return")
+    legend(axes)
     _stage_ticks(axes, len(stages))
-    _label(axes, "stage", "return an episode")
+    label_axes(axes, "stage", "return per episode")
 
 
-def _draw_timid(axes: "Axes", data: ReportData) -> None:
+def _draw_outside(axes: "Axes", data: ReportData) -> None:
     stages = data.stages
+    shares = [
+        np.full(len(stage.cost), np.nan)
+        if stage.outside_share is None
+        else 100 * np.array([finite_mean(column) for column in stage.outside_share.T])
+        for stage in stages
+    ]
     x = np.arange(1, len(stages) + 1)
-    share = np.array([100 * stage.timid_share for stage in stages])
-    axes.bar(x, share, width=0.5, color=MUTED, zorder=2)
-    for place, value in zip(x, share, strict=True):
-        if np.isfinite(value):
-            axes.annotate(
-                f"{value:.0f} %", (place, value), (0, 3), textcoords="offset points",
-                ha="center", fontsize=8.5, color=INK,
-            )  # fmt: skip
-    axes.set_ylim(0, 109)
+    _draw_dots(axes, data, shares)
+    axes.plot(x, [finite_mean(s) for s in shares], color=MEAN, lw=2, label="mean")
+    _reference(axes, data, "outside_share", 100)
+    axes.set_ylim(-4, 109)
     axes.set_yticks([0, 25, 50, 75, 100])
+    legend(axes)
     _stage_ticks(axes, len(stages))
-    _label(axes, "stage", f"agents moving less than {TIMID_DISTANCE:g} m, %")
+    label_axes(axes, "stage", "time outside the arena, %")
 
 
 def _quartiles(values: Array) -> Array:
@@ -293,8 +311,8 @@ def _draw_curves(axes: "Axes", data: ReportData, field: str, label: str) -> None
     if field != "ep_return":
         label = _cost_axis(axes, np.concatenate(drawn), label)
     axes.margins(x=0.02, y=0.1)
-    _legend(axes)
-    _label(axes, "epoch, counted through the stages", label)
+    legend(axes)
+    label_axes(axes, "epoch, counted through the stages", label)
 
 
 def _draw_heat(axes: "Axes", theta: Array, radius: float) -> None:
@@ -316,9 +334,9 @@ def _draw_heat(axes: "Axes", theta: Array, radius: float) -> None:
     if figure is not None:
         bar = figure.colorbar(image, ax=axes, shrink=0.95, pad=0.03)
         bar.ax.tick_params(colors=MUTED, labelcolor=INK, labelsize=8.5, length=3)
-        bar.set_label("intrinsic cost a step", color=INK, fontsize=9)
+        bar.set_label("intrinsic cost per step", color=INK, fontsize=9)
         bar.outline.set_edgecolor(MUTED)  # pyright: ignore
-    _label(axes, "robot x, m", "robot y, m")
+    label_axes(axes, "robot x, m", "robot y, m")
 
 
 def _draw_profile(axes: "Axes", theta: Array, radius: float, obstacle: str) -> None:
@@ -335,5 +353,7 @@ def _draw_profile(axes: "Axes", theta: Array, radius: float, obstacle: str) -> N
     axes.plot(x, cost.mean(1), color=BEST, lw=2, label="mean over bearings")
     axes.set_ylim(0, 1.05 * max(float(cost.max()), 1e-12))
     axes.set_xlim(0, x[-1])
-    _legend(axes)
-    _label(axes, f"distance to the {obstacle}'s centre, m", "intrinsic cost a step")
+    legend(axes)
+    label_axes(
+        axes, f"distance to the {obstacle}'s centre, m", "intrinsic cost per step"
+    )

@@ -5,7 +5,7 @@ import importlib.resources
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 
@@ -44,6 +44,30 @@ def tiles(rows: list[tuple[str, str, str]]) -> str:
         for name, value, note in rows
     )
     return f'<dl class="tiles">{cells}</dl>' if rows else ""
+
+
+def table(
+    caption: str,
+    head: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    zero: Sequence[bool] = (),
+    kind: str = "",
+) -> str:
+    """A table with row headers, of plain text; rows flagged in `zero` are marked."""
+    top = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
+    body = []
+    for row, (first, *rest) in enumerate(rows):
+        mark = ' class="zero"' if row < len(zero) and zero[row] else ""
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in rest)
+        body.append(f'<tr{mark}><th scope="row">{escape(first)}</th>{cells}</tr>')
+    head_row = f"<thead><tr>{top}</tr></thead>" if top else ""
+    label = escape(caption)
+    return (
+        f'<div class="card table"><p class="caption">{label}</p>'
+        f'<div class="scroll {kind}" tabindex="0" role="region" aria-label="{label}">'
+        f'<table class="{kind}" aria-label="{label}">{head_row}'
+        f"<tbody>{''.join(body)}</tbody></table></div></div>"
+    )
 
 
 def asset(name: str) -> str:

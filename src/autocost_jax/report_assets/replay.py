@@ -63,7 +63,7 @@ class Replay:
       steps: how many steps the episode has.
       stride: steps from frame to frame; the last one may be shorter.
       extents: (xmin, ymin, xmax, ymax) of the placements.
-      label: which policy this is, such as "PPO-Lagrangian, sampled actions".
+      label: which policy this is: algorithm and cost, such as "CPO, best cost".
       intrinsic: [F] intrinsic cost, or None.
 
     Raises:
@@ -124,6 +124,7 @@ def replay_json(replay: Replay) -> dict[str, Any]:
     scale = float(np.nanmax(reach, initial=1e-3)) / TOP
     codes = np.concatenate([sent[..., :3] / scale, sent[..., 3:] * TOP], -1)
     return {
+        "label": replay.label,
         "shapes": [_shape_json(shape) for shape in replay.shapes],
         "frames": len(poses),
         "bodies": poses.shape[1],

@@ -1,59 +1,21 @@
 """The sections of the report's page; an empty string where there is no data."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
-from autocost_jax.report_assets.data import ReportData
+from autocost_jax.report_assets.data import NAMES, ReportData
+from autocost_jax.report_assets.diagnosis import describe_cost
 from autocost_jax.report_assets.figures import (
-    NAMES,
-    Draw,
     curve_panels,
     heat_panels,
     stage_panels,
 )
-from autocost_jax.report_assets.markup import escape, number, percent, section
-from autocost_jax.report_assets.player import replay_panel, replay_summary
-from autocost_jax.report_assets.svg import panel_svg
-
-
-def _figures(
-    name: str,
-    panels: Iterable[tuple[str, Draw]],
-    notes: dict[str, tuple[str, str]],
-    last: str = "",
-) -> str:
-    """Figures side by side; `notes` gives the alternative text and the caption."""
-    out = []
-    for key, draw in panels:
-        label, caption = (escape(part) for part in notes[key])
-        svg = panel_svg(draw, f"{name}-{key.replace('_', '-')}", label)
-        out.append(f"<figure>{svg}<figcaption>{caption}</figcaption></figure>")
-    return f'<div class="grid">{"".join(out)}{last}</div>'
-
-
-def _table(
-    caption: str,
-    head: Sequence[str],
-    rows: Iterable[Sequence[str]],
-    zero: Sequence[bool] = (),
-    kind: str = "",
-) -> str:
-    """A table with row headers; rows flagged in `zero` are marked."""
-    top = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
-    body = []
-    for row, (first, *rest) in enumerate(rows):
-        mark = ' class="zero"' if row < len(zero) and zero[row] else ""
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in rest)
-        body.append(f'<tr{mark}><th scope="row">{escape(first)}</th>{cells}</tr>')
-    head_row = f"<thead><tr>{top}</tr></thead>" if top else ""
-    label = escape(caption)
-    return (
-        f'<div class="card table"><p class="caption">{label}</p>'
-        f'<div class="scroll {kind}" tabindex="0" role="region" aria-label="{label}">'
-        f'<table class="{kind}" aria-label="{label}">{head_row}'
-        f"<tbody>{''.join(body)}</tbody></table></div></div>"
-    )
+from autocost_jax.report_assets.markup import escape, number, percent, section, table
+from autocost_jax.report_assets.outcome import TOO_SHORT, candidate_name
+from autocost_jax.report_assets.player import replay_panel
+from autocost_jax.report_assets.replay import Replay
+from autocost_jax.report_assets.svg import figures
 
 
 def _series(values: Iterable[float]) -> str:
@@ -61,7 +23,7 @@ def _series(values: Iterable[float]) -> str:
 
 
 def evolution_section(data: ReportData) -> str:
-    """Costs, returns and timid agents by stage."""
+    """Costs, returns and the time outside the arena, by stage."""
     if not data.stages:
         return ""
     stages = data.stages
@@ -73,24 +35,26 @@ def evolution_section(data: ReportData) -> str:
             f"{_series(stage.mean_cost for stage in stages)}.",
             "Every dot is a candidate: its extrinsic cost after training, mean over "
             "the algorithms (the highest, in a search that judges by the worst). The "
-            f"red line is zero violation.{lost}",
+            f"red line is zero.{lost}",
         ),
         "return": (
             "Return of every candidate by stage. Stage means: "
             f"{_series(stage.mean_return for stage in stages)}.",
             "The same candidates' returns: what safety costs in performance.",
         ),
-        "timid": (
-            "Share of agents that hardly move, by stage, in percent: "
-            f"{_series(100 * stage.timid_share for stage in stages)}.",
-            f"The timid solution: avoiding every {data.obstacle} by standing still.",
+        "outside": (
+            "Share of the steps that agents spend outside the arena, by stage, in "
+            f"percent: {_series(100 * stage.mean_outside_share for stage in stages)}.",
+            "Fleeing is no safe driving: outside the arena there is no "
+            f"{data.obstacle} to hit and no goal to meet.",
         ),
     }
     return section(
         "evolution",
         "Evolution",
-        "How the population changed from stage to stage.",
-        _figures("evolution", stage_panels(data), notes),
+        "How the population changed from stage to stage."
+        + ("" if data.can_violate else f" {TOO_SHORT}"),
+        figures("evolution", stage_panels(data), notes),
     )
 
 
@@ -104,8 +68,8 @@ def best_section(data: ReportData) -> str:
         "map": (
             f"Heat map of the best intrinsic cost over robot positions around a {name} "
             "at the origin, which is drawn as a circle.",
-            f"The robot looks along +x; a single {name} (circle) stands at the origin. "
-            "Lidar of 8 bins, exponential, gain 1. The scale starts at 0.",
+            f"The robot's place; {_facing(data)}. A single {name} (circle) stands at "
+            "the origin. Lidar of 8 bins, exponential, gain 1. The scale starts at 0.",
         ),
         "profile": (
             f"The same cost against the distance to the {name}'s centre.",
@@ -114,55 +78,89 @@ def best_section(data: ReportData) -> str:
         ),
     }
     panels = heat_panels(best.theta, data.obstacle_radius, name)
-    where = f"Stage {best.stage + 1}, candidate {best.index}: {best.label}."
+    name_of_best = candidate_name(best.stage, best.index)
+    where = f"{name_of_best[0].upper()}{name_of_best[1:]}"
+    # A label may speak of zero violations, which short episodes do not show.
+    where += f": {best.label}." if data.can_violate else "."
+    drawn = figures("best", panels, notes, _card(data))
+    verdict = f'<div class="diagnosis">{_list(_diagnosis(data))}</div>'
+    return section("best", "The best cost", escape(where), verdict, drawn)
+
+
+def _diagnosis(data: ReportData) -> list[str]:
+    """What is wrong with the best cost."""
+    best = data.best
+    if best is None:
+        return []
+    stage = data.stages[best.stage]
+    far, near = (
+        np.nan if values is None else float(values[best.index])
+        for values in (stage.far_cost, stage.near_cost)
+    )
+    return describe_cost(
+        best.theta,
+        data.obstacle_radius,
+        far,
+        near,
+        obstacle=data.obstacle,
+        heading=_heading(data),
+    )
+
+
+def _facing(data: ReportData) -> str:
+    """How the robot stands in the map."""
+    heading = _heading(data)
+    if heading is None:
+        return "its x axis points along +x everywhere"
+    quarter = round(heading / (np.pi / 2)) % 4
+    return f"it faces {('+x', '+y', '−x', '−y')[quarter]} everywhere"
+
+
+def _heading(data: ReportData) -> float | None:
+    """What is ahead in the robot's frame, as `Replay.heading`; None if unknown."""
+    return data.replays[0].heading if data.replays else None
+
+
+def _card(data: ReportData) -> str:
+    """The best cost's scores and parameters."""
+    best = data.best
+    if best is None:
+        return ""
+    stage = data.stages[best.stage]
+    scores = (
+        f"return at the end of its stage: {number(stage.ep_return[best.index])}",
+        f"extrinsic cost there: {number(stage.cost[best.index])}",
+    )
     theta = "\n".join(
         "  ".join(f"{value: .6g}" for value in best.theta[i : i + 4])
         for i in range(0, len(best.theta), 4)
     )
-    stage = data.stages[best.stage]
-    scores = (
-        f"return {number(stage.ep_return[best.index])}",
-        f"extrinsic cost {number(stage.cost[best.index])}",
-    )
-    lines = "".join(f"<li>{escape(line)}</li>" for line in (*scores, *best.card))
-    card = (
-        f'<div class="card"><h3>Its card</h3><ul class="facts">{lines}</ul>'
+    return (
+        f'<div class="card"><h3>Its card</h3>{_list((*scores, *best.card))}'
         f"<details><summary>Its {len(best.theta)} parameters</summary><p>W1 (rows of "
         f"4), b1, W2, b2:</p><pre>{escape(theta)}</pre></details></div>"
     )
-    figures = _figures("best", panels, notes, card)
-    return section("best", "The best cost", escape(where), figures)
+
+
+def _list(lines: Iterable[str]) -> str:
+    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return f'<ul class="facts">{items}</ul>'
 
 
 def replay_section(data: ReportData) -> str:
-    """An episode of the best policy."""
-    if data.replay is None or not data.replay.steps:
+    """Recorded episodes, two beside each other where there are two."""
+    shown = played(data)
+    if not shown:
         return ""
-    lead = f"{data.replay.label}. {replay_summary(data.replay)}".removeprefix(". ")
-    body = replay_panel(data.replay)
-    return section("replay", "Replay of the best policy", escape(lead), body)
+    lead = "Recorded episodes; actions are sampled unless the label says otherwise."
+    if len(shown) > 1:
+        lead += " Both run under one slider."
+    return section("replay", "Replays", lead, replay_panel(shown))
 
 
-def evaluations_section(data: ReportData) -> str:
-    """The table of fresh evaluation episodes."""
-    if not data.evaluations:
-        return ""
-    rows = [
-        [
-            row.label,
-            f"{number(row.return_mean)} ± {number(row.return_ci)}",
-            f"{number(row.cost_mean)} ± {number(row.cost_ci)}",
-            percent(row.violation_rate),
-            f"{row.episodes:,}",
-        ]
-        for row in data.evaluations
-    ]
-    head = ["policy", "return", "extrinsic cost", "episodes in violation", "episodes"]
-    caption = "Mean and half-width of the 95 % interval over episodes."
-    table = _table(
-        caption, head, rows, [r.violation_rate == 0 for r in data.evaluations]
-    )
-    return section("evaluation", "Evaluation on fresh episodes", "", table)
+def played(data: ReportData) -> tuple[Replay, ...]:
+    """The replays that have a step."""
+    return tuple(replay for replay in data.replays if replay.steps)
 
 
 def curves_section(data: ReportData) -> str:
@@ -176,7 +174,7 @@ def curves_section(data: ReportData) -> str:
     notes = {
         key: (f"Learning curves: {name} by epoch.", f"{note} {caption}")
         for key, name, note in (
-            ("ep_return", "return", "Return of an episode."),
+            ("ep_return", "return", "Return per episode."),
             ("ep_cost", "extrinsic cost", "What a candidate is scored on."),
             ("ep_total_cost", "total cost", "Extrinsic + intrinsic: what is learnt."),
         )
@@ -185,7 +183,7 @@ def curves_section(data: ReportData) -> str:
         "learning",
         "Learning curves",
         "Agents start from scratch in every stage (dotted lines).",
-        _figures("learning", curve_panels(data), notes),
+        figures("learning", curve_panels(data), notes),
     )
 
 
@@ -194,23 +192,29 @@ def stages_section(data: ReportData) -> str:
     if not data.stages:
         return ""
     head = ["stage", "candidates", "mean cost", "median cost", "lowest cost",
-            "mean return", "zero violation", "diverged", "timid agents",
-            "selected"]  # fmt: skip
+            "mean return", "violating episodes", "no violation", "time outside",
+            "diverged", "selected"]  # fmt: skip
     rows = []
     for place, stage in enumerate(data.stages, 1):
-        cost = stage.cost[stage.finite]
+        cost, judged = stage.cost[stage.finite], data.can_violate
         rows.append([
             str(place), str(len(stage.cost)), number(stage.mean_cost),
             number(np.median(cost) if cost.size else np.nan),
             number(np.min(cost, initial=np.inf)), number(stage.mean_return),
-            str(int(stage.zero_violation.sum())), str(int((~stage.finite).sum())),
-            percent(stage.timid_share), ", ".join(str(int(i)) for i in stage.elites),
+            percent(stage.mean_violation_rate) if judged else "–",
+            str(int(stage.zero_violation.sum())) if judged else "–",
+            percent(stage.mean_outside_share), str(int((~stage.finite).sum())),
+            ", ".join(str(int(i) + 1) for i in stage.elites),
         ])  # fmt: skip
-    caption = "Costs are extrinsic, an episode; selected candidates stand best first."
+    caption = (
+        "Costs are extrinsic, per episode; no violation: how many candidates had none "
+        "at the end of training; selected candidates stand best first."
+    )
+    caption += "" if data.can_violate else f" {TOO_SHORT}"
     details = (
         f"<details><summary>Every candidate</summary>{_candidates(data)}</details>"
     )
-    return section("stages", "Stages", "", _table(caption, head, rows), details)
+    return section("stages", "Stages", "", table(caption, head, rows), details)
 
 
 def _candidates(data: ReportData) -> str:
@@ -223,7 +227,7 @@ def _candidates(data: ReportData) -> str:
         ranks = {int(i): str(rank) for rank, i in enumerate(stage.elites, 1)}
         for i in range(len(stage.cost)):
             row = [
-                f"{place} / {i}",
+                f"{place} / {i + 1}",
                 number(stage.cost[i]),
                 number(stage.ep_return[i]),
             ]
@@ -233,9 +237,11 @@ def _candidates(data: ReportData) -> str:
             for values in (stage.far_cost, stage.near_cost):
                 row.append("–" if values is None else number(values[i]))
             rows.append([*row, ranks.get(i, "")])
-            zero.append(bool(stage.zero_violation[i]))
-    caption = "A green bar marks zero violation; – a diverged agent or no such state."
-    return _table(caption, head, rows, zero, "tall")
+            zero.append(bool(stage.zero_violation[i]) and data.can_violate)
+    caption = "– is a diverged agent, or no such state."
+    if data.can_violate:
+        caption += " A green bar marks a candidate without a violation."
+    return table(caption, head, rows, zero, "tall")
 
 
 def config_section(data: ReportData) -> str:
@@ -244,5 +250,5 @@ def config_section(data: ReportData) -> str:
     rows = [*data.config.items(), ("policies", f"{policies} actions")]
     if data.deterministic:
         rows[-1] = ("policies", policies)
-    table = _table("What was run.", [], rows, kind="plain")
-    return section("config", "Configuration", "", table)
+    body = table("What was run.", [], rows, kind="plain")
+    return section("config", "Configuration", "", body)

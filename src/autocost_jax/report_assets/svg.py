@@ -2,6 +2,7 @@
 
 import io
 import re
+from collections.abc import Iterable, Mapping
 
 from autocost_jax.report_assets.figures import (
     ALGORITHM_COLOURS,
@@ -19,6 +20,7 @@ from autocost_jax.report_assets.figures import (
     add_axes,
     make_figure,
 )
+from autocost_jax.report_assets.markup import escape
 
 # on the page these become CSS variables, so that figures follow the dark mode
 CSS_VARIABLES = {
@@ -56,3 +58,26 @@ def panel_svg(draw: Draw, name: str, label: str) -> str:
         body = body.replace(colour, f"var(--{variable})")
     size = view.group(0) if view else ""
     return f'<svg {size} role="img" aria-label="{label}">{body}'
+
+
+def figures(
+    name: str,
+    panels: Iterable[tuple[str, Draw]],
+    notes: Mapping[str, tuple[str, str]],
+    last: str = "",
+) -> str:
+    """Figures side by side.
+
+    Args:
+      name: prefix of their ids, unique on the page.
+      panels: (key, drawing) of each.
+      notes: key -> (alternative text, caption), plain text.
+      last: HTML of a last cell.
+    """
+    out = []
+    for key, draw in panels:
+        label, caption = (escape(part) for part in notes[key])
+        place = re.sub(r"[^a-z0-9]+", "-", key.lower())
+        svg = panel_svg(draw, f"{name}-{place}", label)
+        out.append(f"<figure>{svg}<figcaption>{caption}</figcaption></figure>")
+    return f'<div class="grid">{"".join(out)}{last}</div>'

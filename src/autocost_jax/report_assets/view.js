@@ -24,7 +24,7 @@ const view3d = (function () {
   function topCamera(x, y, half, width, height) {
     const scale = Math.min(width, height) / (2 * half);
     return {
-      flat: true, eye: [x, y, 50], towards: [0, 0, -1], right: [1, 0, 0], up: [0, 1, 0],
+      flat: true, horizon: 0, eye: [x, y, 50], towards: [0, 0, -1], right: [1, 0, 0], up: [0, 1, 0],
       project: (p) => [width / 2 + (p[0] - x) * scale, height / 2 - (p[1] - y) * scale, 50 - p[2]],
       radius: (r) => r * scale,
     };
@@ -34,8 +34,10 @@ const view3d = (function () {
     const c = Math.cos(elevation), towards = [-c * Math.cos(azimuth), -c * Math.sin(azimuth), -Math.sin(elevation)];
     const eye = add(target, towards, -distance), right = unit(cross(towards, [0, 0, 1])), up = cross(right, towards);
     const focal = 2 * Math.min(width, 1.25 * height);
+    const depthOf = (p) => dot(add(p, eye, -1), towards);
     return {
-      flat: false, eye, towards, right, up,
+      flat: false, eye, towards, right, up, depthOf,
+      horizon: height / 2 - focal * Math.tan(elevation), // its line on the canvas
       project(p) {
         const v = add(p, eye, -1), depth = dot(v, towards);
         return depth < NEAR ? null : [width / 2 + (focal * dot(v, right)) / depth, height / 2 - (focal * dot(v, up)) / depth, depth];
@@ -58,9 +60,20 @@ const view3d = (function () {
 
   // ---- flat things
 
-  function trace(pen, camera, points) { // a closed path; false if a corner is behind the eye
-    const seen = points.map(camera.project);
-    if (seen.includes(null)) return false;
+  function clip(camera, points) { // the part of a polygon that is in front of the eye
+    if (camera.flat) return points;
+    const depth = points.map(camera.depthOf), near = NEAR * 1.001;
+    if (depth.every((d) => d >= near)) return points;
+    return points.flatMap((p, i) => {
+      const j = (i + 1) % points.length, out = depth[i] >= near ? [p] : [];
+      if ((depth[i] < near) !== (depth[j] < near)) out.push(add(p, add(points[j], p, -1), (near - depth[i]) / (depth[j] - depth[i])));
+      return out;
+    });
+  }
+
+  function trace(pen, camera, points) { // a closed path; false if nothing of it is in front of the eye
+    const seen = clip(camera, points).map(camera.project);
+    if (!seen.length || seen.includes(null)) return false;
     pen.moveTo(seen[0][0], seen[0][1]);
     for (let i = 1; i < seen.length; i++) pen.lineTo(seen[i][0], seen[i][1]);
     pen.closePath();
@@ -74,6 +87,12 @@ const view3d = (function () {
     if (style.fill) { pen.fillStyle = style.fill; pen.fill(); }
     if (style.stroke && veil === 1) { pen.globalAlpha = style.line === undefined ? 1 : style.line; pen.strokeStyle = style.stroke; pen.lineWidth = style.width || 1; pen.stroke(); }
     pen.globalAlpha = 1;
+  }
+
+  function fillAll(pen, camera, polygons, fill, alpha) { // many at once, in one colour
+    pen.beginPath();
+    for (const points of polygons) trace(pen, camera, points);
+    pen.globalAlpha = alpha; pen.fillStyle = fill; pen.fill(); pen.globalAlpha = 1;
   }
 
   function circle(x, y, z, r, corners) {
@@ -270,5 +289,5 @@ const view3d = (function () {
     pen.globalAlpha = alpha; pen.fillStyle = "#000"; pen.fill(); pen.globalAlpha = 1;
   }
 
-  return { add, dot, unit, axes, turn, topCamera, orbitCamera, polygon, circle, drawThing, drawShadows, faces };
+  return { add, dot, unit, axes, turn, topCamera, orbitCamera, polygon, fillAll, circle, drawThing, drawShadows, faces };
 })();
