@@ -121,7 +121,7 @@ def verdict(data: ReportData) -> str:
         )
     text += reached if any_zero else ""
     if data.best is None:
-        return f"{text}; every candidate diverged, so there is no best cost."
+        return f"{text}; every candidate of a stage diverged, so there is no best cost."
     stage, index = data.stages[data.best.stage], data.best.index
     best = (
         f"candidate {index} of stage {data.best.stage + 1} (return "
