@@ -376,9 +376,13 @@ def test_a_run_that_failed_stays_failed(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(evolution, "make_agents", broken_agents)
     config = search_config(train=train_config(num_epochs=3), num_stages=2)
     path = tmp_path / "run"
+
+    def attempt(resume):
+        run_search(config, path, resume=resume)
+
     for resume in (False, True):
         with pytest.raises(SystemExit) as stop:
-            guarded(lambda r=resume: run_search(config, path, resume=r), "search")
+            guarded(lambda r=resume: attempt(r), "search")
         assert stop.value.code == 1
         error = capsys.readouterr().err
         assert error.startswith("search: every candidate of stage 0 failed")

@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -286,7 +287,7 @@ def test_an_environment_of_another_length_is_refused(function, segments):
 def test_an_environment_needs_no_configuration_of_its_own(env):
     """A user's own may be any object with the functions and the sizes."""
     names = ("reset", "step", "observation_size", "action_size", "episode_length")
-    bare = SimpleNamespace(**{name: getattr(env, name) for name in names})
+    bare: Any = SimpleNamespace(**{name: getattr(env, name) for name in names})
     agent, config = linear_agent(env), train_config(num_epochs=1)
     _, metrics = jax.jit(lambda slot: train(bare, agent, slot, config))(make_slot())
     _, expected = jax.jit(lambda slot: train(env, agent, slot, config))(make_slot())

@@ -149,9 +149,8 @@ def _train_defaults(argv: list[str], out: Path) -> tuple[Any, Any]:
 
         named = flag(argv, "--out")
         recorded, _ = read_config(out if named is None else named, TableConfig)
-    own = recorded is not None and name is None
-    train = recorded.train if own else preset(name or "laptop").train
-    return recorded, with_env(train, argv)
+    source = preset(name or "laptop") if recorded is None or name else recorded
+    return recorded, with_env(source.train, argv)
 
 
 def _theta(path: Path | None) -> tuple[float, ...] | None:
