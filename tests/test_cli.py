@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from autocost_jax.cli import main
+from autocost_jax.config import preset
 from autocost_jax.methods import Method, TableConfig, table_slots
-from autocost_jax.store import read_metrics
+from autocost_jax.store import open_run, read_metrics
 
 TRAIN = ["train", "--preset", "smoke", "--episodes", "3"]
 
@@ -43,6 +44,44 @@ def test_train_resumes_and_ends_the_same(trained, capsys):
     main([*TRAIN, *flags, "--resume"])
     assert "resuming" in capsys.readouterr().out
     assert (trained / "evaluation.json").read_text() == before
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """The tables that the command line would train."""
+    tables = []
+    monkeypatch.setattr(
+        "autocost_jax.methods.run_table", lambda config, *_, **__: tables.append(config)
+    )
+    return tables
+
+
+def test_train_resumes_with_another_population_chunk(trained, asked):
+    """And without the other flags, which default to the run's own settings."""
+    main(["train", "--out", str(trained), "--resume", "--population-chunk", "2"])
+    (table,) = asked
+    assert table.train.population_chunk == 2
+    with open_run(trained, table, resume=True, overwrite=False) as run:
+        assert run.config == table
+
+
+def test_train_resumed_with_another_setting_is_refused(trained, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "--out", str(trained), "--resume", "--num-worlds", "4"])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert "train.num_worlds=2" in error
+    assert "train.num_worlds=4" in error
+
+
+def test_of_a_flag_given_twice_the_last_wins(trained, asked):
+    main(["train", "--preset=laptop", "--preset", "smoke"])
+    main(["train", "--resume", "--out", "nowhere", f"--out={trained}"])
+    main(["train", "--resume", "--no-resume", "--out", str(trained)])
+    smoke, resumed, fresh = asked
+    assert smoke.train == preset("smoke").train
+    assert [method.label for method in resumed.methods] == ["ppo", "cpo"]
+    assert fresh.train == preset("laptop").train
 
 
 def test_evaluate_scores_saved_policies(trained, tmp_path, capsys):

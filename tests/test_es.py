@@ -16,6 +16,7 @@ from autocost_jax.es import (
     QUIET_PLACES,
     Fitness,
     best,
+    failed_stage,
     graded_start,
     keep_level,
     monotone_start,
@@ -446,6 +447,30 @@ def test_a_broken_candidate_is_never_the_pick(cost, ep_return):
     stage = ([cost] * 5 + [1e6], [ep_return] * 5 + [-1e6])
     pick, _ = run_stages([stage, stage])
     assert place(pick) == (0, 5, False)
+
+
+@pytest.mark.parametrize("whole_stage", [0, 1])
+@pytest.mark.parametrize(("cost", "ep_return"), BROKEN)
+def test_a_stage_without_survivors_leaves_no_pick(cost, ep_return, whole_stage):
+    """Not even of the other stage; a search that was told nothing has none either."""
+    stages = [([1.0] * 6, [1.0] * 6)] * 2
+    stages[whole_stage] = ([cost] * 6, [ep_return] * 6)
+    pick, _ = run_stages(stages)
+    untold = best(SMALL_ES.init(), SMALL.population_size)
+    for nothing in (pick, untold):
+        assert place(nothing) == (-1, -1, False)
+        assert np.isnan(nothing.candidate).all()
+        assert (float(nothing.cost), float(nothing.ep_return)) == (np.inf, -np.inf)
+
+
+def test_the_failed_stage_is_the_first_one():
+    es, size, key = SMALL_ES, SMALL.population_size, jax.random.key(0)
+    state, seen = es.init(), [int(failed_stage(SMALL_ES.init(), size))]
+    for cost in (1.0, jnp.inf, jnp.inf):
+        told = ([cost] * 5 + [jnp.inf], [0.0] * 6)
+        _, state = tell_once(es, key, state, *told)
+        seen.append(int(failed_stage(state, size)))
+    assert seen == [-1, -1, 1, 1]
 
 
 # The search as a whole -------------------------------------------------------

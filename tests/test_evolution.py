@@ -1,6 +1,7 @@
 """The search on the toy environment: watched, resumed or pure, it is one search."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from autocost_jax import evolution, population
+from autocost_jax.commandline import guarded
 from autocost_jax.costs import BANK, CostTerm
 from autocost_jax.es import truncation_es
 from autocost_jax.evolution import (
@@ -21,6 +23,10 @@ from autocost_jax.evolution import (
     stage_result,
     stage_slots,
 )
+from autocost_jax.report import render_report
+from autocost_jax.run import run_search
+from autocost_jax.store import list_stages
+from autocost_jax.summary import load_report
 from toys import (
     Counter,
     linear_agent,
@@ -324,8 +330,78 @@ def test_a_frozen_candidate_is_never_an_elite(searcher):
 def test_a_stage_without_survivors_ends_the_search(searcher):
     state = poison(searcher, range(CONFIG.population_size))
     seen = []
+    events = (
+        (copy(after), report)
+        for after, report in evolve(CONFIG, searcher=searcher, state=state)
+    )
     with pytest.raises(RuntimeError, match="every candidate of stage 0 failed"):
-        seen.extend(evolve(CONFIG, searcher=searcher, state=state))
+        seen.extend(events)
+    assert len(seen) == CONFIG.train.num_epochs
+    failed = seen[-1][0]
+    for go_on in (
+        lambda: run(searcher=searcher, state=copy(failed)),
+        lambda: best_of(CONFIG, failed.es),
+    ):
+        with pytest.raises(RuntimeError, match="every candidate of stage 0 failed"):
+            go_on()
+
+
+def test_nothing_is_best_before_the_first_stage(searcher):
+    with pytest.raises(RuntimeError, match="before its first stage"):
+        best_of(CONFIG, init_search(searcher).es)
+
+
+def broken_agents(algorithms, config, env):
+    """Agents that turn to NaN in their first update."""
+    del config
+    agent = linear_agent(env)
+
+    def update(state, *rest):
+        after, metrics = agent.update(state, *rest)
+        return after.replace(weights=jnp.nan * after.weights), metrics
+
+    return tuple(agent._replace(update=update) for _ in algorithms)
+
+
+def test_the_pure_search_of_broken_agents_has_no_best(monkeypatch):
+    monkeypatch.setattr(evolution, "make_agents", broken_agents)
+    config = search_config(train=train_config(num_epochs=3), num_stages=2)
+    es = jax.jit(search(config))(jax.random.key(0)).es
+    with pytest.raises(RuntimeError, match="every candidate of stage 0 failed"):
+        best_of(config, es)
+
+
+def test_a_run_that_failed_stays_failed(monkeypatch, tmp_path, capsys):
+    """Resumed it says so again, nothing is published, and its report has no best."""
+    monkeypatch.setattr(evolution, "make_agents", broken_agents)
+    config = search_config(train=train_config(num_epochs=3), num_stages=2)
+    path = tmp_path / "run"
+
+    def attempt(resume):
+        run_search(config, path, resume=resume)
+
+    for resume in (False, True):
+        with pytest.raises(SystemExit) as stop:
+            guarded(lambda r=resume: attempt(r), "search")
+        assert stop.value.code == 1
+        error = capsys.readouterr().err
+        assert error.startswith("search: every candidate of stage 0 failed")
+        assert error.count("\n") == 1
+        left = {file.name for file in path.iterdir()}
+        assert not left & {"cost.npz", "cost.json", "replay.npz", "report", "policies"}
+    assert list(list_stages(path)) == [0]
+    data = load_report(path)
+    assert data.best is None
+    assert "every candidate of a stage diverged" in render_report(data)
+
+    # As an earlier version left it, which resumed past the failure.
+    row = {"return_mean": 0.0, "return_ci": 0.0, "cost_mean": 0.0, "cost_ci": 0.0}
+    row |= {"violation_rate": 0.0, "distance_travelled": 0.0, "episodes": 4}
+    card = {"stage": 0, "index": 0, "search_cost": "Infinity"}
+    card["evaluation"] = {"cpo": row}
+    (path / "cost.json").write_text(json.dumps(card))
+    data = load_report(path)
+    assert (data.best, data.replay, data.evaluations) == (None, None, ())
 
 
 def test_random_selection_is_another_search(events):

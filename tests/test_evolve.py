@@ -1,5 +1,6 @@
 """The main job from its command line: whole, killed, resumed, and misused."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -18,7 +19,15 @@ from autocost_jax import evolve as evolve_module
 from autocost_jax.commandline import use_compile_cache
 from autocost_jax.config import preset
 from autocost_jax.evolve import main
-from autocost_jax.store import RunDirError, list_stages, read_config, read_metrics
+from autocost_jax.rundata import first_difference
+from autocost_jax.store import (
+    RunDir,
+    RunDirError,
+    list_stages,
+    open_run,
+    read_config,
+    read_metrics,
+)
 from autocost_jax.summary import load_report
 
 SMOKE = ["--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "4"]
@@ -222,6 +231,63 @@ def test_resume_with_another_config_names_the_difference(capsys, whole):
     assert "seed=3" in error
     assert "seed=4" in error
     assert (out / "metrics.jsonl").read_bytes() == before
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What the command line would run: lists of configuration, path, resume."""
+    calls = []
+
+    def run_search(config, path, *, resume, **_):
+        calls.append((config, path, resume))
+
+    monkeypatch.setattr("autocost_jax.run.run_search", run_search)
+    return calls
+
+
+def test_resume_uses_another_population_chunk(asked, tmp_path):
+    recorded = dataclasses.replace(preset("smoke"), seed=3)
+    RunDir.create(tmp_path, recorded, {}).close()
+    main(["--out", str(tmp_path), "--resume", "--population-chunk", "3"])
+    ((config, _, resume),) = asked
+    assert resume
+    assert config.train.population_chunk == 3
+    assert first_difference(recorded, config) is None
+    with open_run(tmp_path, config, resume=True, overwrite=False) as run:
+        assert run.config == config
+
+
+@pytest.mark.parametrize("form", ["{} {}", "{}={}"])
+def test_of_a_flag_given_twice_the_last_wins(asked, tmp_path, form):
+    one, two = tmp_path / "one", tmp_path / "two"
+    for path, seed in ((one, 1), (two, 2)):
+        RunDir.create(path, dataclasses.replace(preset("smoke"), seed=seed), {}).close()
+
+    def flags(name, *values):
+        return [word for v in values for word in form.format(name, v).split()]
+
+    main([*flags("--preset", "laptop", "smoke"), *flags("--out", one, two)])
+    worlds = flags("--env", "Push-Hazard-Point", "Goal-Pillar-Point")
+    main([*flags("--preset", "laptop", "smoke"), *worlds])
+    main(["--resume", *flags("--out", one, two)])
+    main(["--dry-run", "--no-dry-run", *flags("--config", one, two)])
+    (first, path, _), (second, *_), (third, _, resume), (fourth, *_) = asked
+    assert (first, path) == (preset("smoke"), two)
+    assert second.train.env.name == "Goal-Pillar-Point"
+    assert second.train.env.num_steps == preset("smoke").train.env.num_steps
+    assert (third.seed, resume) == (2, True)
+    assert fourth.seed == 2
+
+
+def test_of_resume_and_no_resume_the_last_wins(asked, tmp_path):
+    out = ["--out", str(tmp_path / "run")]
+    RunDir.create(tmp_path / "run", preset("smoke"), {}).close()
+    main([*out, "--no-resume", "--resume"])
+    main([*out, "--resume", "--no-resume"])
+    main([*out, "--resume", "--no_resume"])
+    assert [resume for *_, resume in asked] == [True, False, False]
+    configs = [config for config, *_ in asked]
+    assert configs == [preset("smoke"), preset("laptop"), preset("laptop")]
 
 
 def test_a_run_is_not_overwritten_by_accident(capsys, whole):

@@ -21,7 +21,14 @@ from autocost_jax.population import (
     stack_slots,
 )
 from autocost_jax.train import final_episodes, init_learner, run_stage
-from toys import TRAIN, Counter, intrinsic_slots, make_toy_env, train_config
+from toys import (
+    TRAIN,
+    Counter,
+    intrinsic_slots,
+    linear_agent,
+    make_toy_env,
+    train_config,
+)
 
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 SIZE, MORE = 4, 8  # slots a group
@@ -354,6 +361,23 @@ def test_slots_that_learn_in_turns_need_less_memory():
     assert workspace(1) < 0.9 * workspace(MORE)
 
 
+def test_a_compiled_program_runs_for_its_own_sizes_alone(caplog):
+    """They are not compiled again; other sizes are when they come."""
+    env = make_toy_env()
+    agents = tuple(linear_agent(env) for _ in ALGORITHMS)
+    population = make_population(env, agents, TRAIN)
+    population.compile(population.init(groups()), groups())
+    for size, compiles in ((MORE, 1), (SIZE, 0)):
+        slots = groups(size)
+        caplog.clear()
+        with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
+            learners, metrics = population.chunk(population.init(slots), slots, 0)
+        lines = [record.getMessage() for record in caplog.records]
+        assert sum("Compiling jit(chunk)" in line for line in lines) == compiles
+        assert metrics[0]["ep_cost"].shape == (1, size)
+        assert len(learners[0].frozen) == size
+
+
 def test_candidates_share_their_random_numbers(key):
     slots = candidate_slots(groups()[0].cost, key)
     assert slots.key.shape == slots.constrained.shape == (SIZE,)
@@ -382,6 +406,12 @@ def test_the_evaluator_plays_the_same_layouts_for_all(key, reference):
     assert (start == start[:1]).all()
     assert len(np.unique(start[0], axis=0)) == 5
     assert len(np.unique(result.ep_return[:, 0])) == SIZE
+
+
+def test_an_environment_of_another_length_is_refused_when_the_program_is_built():
+    env = make_toy_env(TRAIN.env.num_steps + 1)
+    with pytest.raises(ValueError, match=r"episodes of 17 steps.* of 16 \("):
+        make_population(env, (linear_agent(env),), TRAIN)
 
 
 def test_only_this_module_names_the_algorithms():

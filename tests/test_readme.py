@@ -27,7 +27,6 @@ def test_the_python_example_runs(capsys):
     assert len(code.strip().splitlines()) <= 13
     # The same lines at a size that a test can afford.
     code = code.replace('preset("laptop")', 'preset("smoke")')
-    code = code.replace('make_env("Goal-Hazard-Point")', "make_env(config.env)")
     exec(compile(code, "README.md", "exec"), {})
     first, second = capsys.readouterr().out.strip().splitlines()
     assert len(first.split()) == 2

@@ -233,6 +233,29 @@ def test_open_names_the_first_difference(run: RunDir) -> None:
         assert again.warnings == []
 
 
+def test_open_lets_population_chunk_differ(run: RunDir) -> None:
+    """It is used; the recorded configuration and the checkpoints stay as they are."""
+    run.save_checkpoint({"a": jnp.ones(1)}, 1)
+    run.close()
+    recorded = (run.path / "config.yaml").read_bytes()
+    train = dataclasses.replace(SMOKE.train, population_chunk=3)
+    other = dataclasses.replace(SMOKE, train=train)
+    with RunDir.open(run.path, other) as again:
+        assert again.config.train.population_chunk == 3
+        found = again.resume({"a": jnp.ones(1)})
+        assert found is not None
+        assert found.step == 1
+        again.save_checkpoint({"a": jnp.ones(1)}, 2)
+    assert (run.path / "config.yaml").read_bytes() == recorded
+    with RunDir.open(run.path) as again:
+        found = again.resume({"a": jnp.ones(1)})
+        assert found is not None
+        assert (found.step, found.warnings) == (2, [])
+    both = dataclasses.replace(other, seed=9)
+    with pytest.raises(RunDirError, match="seed=0"):
+        RunDir.open(run.path, both)
+
+
 def test_open_warns_of_other_versions(tmp_path: Path) -> None:
     facts = {**FACTS, "versions": {**FACTS["versions"], "jax": "0.0.1"}}
     RunDir.create(tmp_path, SMOKE, facts).close()

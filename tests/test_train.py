@@ -1,6 +1,8 @@
 """Training one slot and many: learning, metrics, freezing, and a user's own parts."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ from autocost_jax.records import CostInputs, Slot, Trajectory
 from autocost_jax.train import (
     awareness,
     episode_metrics,
+    final_episodes,
     init_learner,
     run_epoch,
     run_stage,
@@ -255,6 +258,40 @@ def test_some_failed_worlds_do_not_freeze():
     assert int(state.epochs) == config.num_epochs
     assert not metrics["frozen"].any()
     assert all(0 < n < config.num_worlds for n in metrics["failed_worlds"])
+
+
+# Lengths of an episode -------------------------------------------------------
+
+
+@pytest.mark.parametrize("segments", [1, 2])
+@pytest.mark.parametrize("function", ["train", "run_stage", "run_epoch", "final"])
+def test_an_environment_of_another_length_is_refused(function, segments):
+    """While tracing, by everything that takes both; the message has both lengths."""
+    env = make_toy_env(5 * NUM_STEPS)
+    agent, config = linear_agent(env), train_config(segments_per_episode=segments)
+    slot = make_slot()
+    slots = (jax.tree.map(lambda x: x[None], slot),)
+    fresh = (jax.vmap(lambda slot: init_learner(agent, slot))(slots[0]),)
+    calls = {
+        "train": lambda: train(env, agent, slot, config),
+        "run_stage": lambda: run_stage(env, (agent,), config, fresh, slots),
+        "run_epoch": lambda: run_epoch(
+            env, (agent,), config, fresh, slots, jnp.zeros((), jnp.int32)
+        ),
+        "final": lambda: final_episodes(env, (agent,), config, fresh, slots, 1),
+    }
+    with pytest.raises(ValueError, match=r"episodes of 80 steps.* of 16 \("):
+        jax.eval_shape(calls[function])
+
+
+def test_an_environment_needs_no_configuration_of_its_own(env):
+    """A user's own may be any object with the functions and the sizes."""
+    names = ("reset", "step", "observation_size", "action_size", "episode_length")
+    bare: Any = SimpleNamespace(**{name: getattr(env, name) for name in names})
+    agent, config = linear_agent(env), train_config(num_epochs=1)
+    _, metrics = jax.jit(lambda slot: train(bare, agent, slot, config))(make_slot())
+    _, expected = jax.jit(lambda slot: train(env, agent, slot, config))(make_slot())
+    np.testing.assert_array_equal(metrics["ep_return"], expected["ep_return"])
 
 
 # A user's own parts ----------------------------------------------------------

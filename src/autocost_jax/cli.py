@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +13,7 @@ from autocost_jax.commandline import (
     guarded,
     parse,
     quiet,
+    switch,
     use_compile_cache,
     use_devices,
     with_env,
@@ -53,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _train(argv: list[str]) -> None:
     import tyro
 
-    from autocost_jax.config import TrainConfig, preset
+    from autocost_jax.config import TrainConfig
 
     @dataclass(frozen=True)
     class Options:
@@ -69,7 +70,8 @@ def _train(argv: list[str]) -> None:
           num_seeds: seeds 0 ... N - 1.
           preset: whose sizes the other flags default to.
           out: run directory.
-          resume: continue the run in `out` with its own settings.
+          resume: continue the run in `out` with its own methods and settings, to which
+            the other flags default; only population-chunk may be another.
           overwrite: start over in a directory that already holds a run.
           devices: devices to use; default: all; a CPU counts one a core.
           coordinator: of a run in several processes, HOST:PORT of the first one, or
@@ -103,18 +105,16 @@ def _train(argv: list[str]) -> None:
             default_factory=TrainConfig
         )
 
-    train = preset(flag(argv, "--preset") or "laptop").train
-    default = Options(train=with_env(train, argv))
-    options = parse(Options, argv, "autocost train", default=default)
+    recorded, train = _train_defaults(argv, Options.out)
+    options = parse(Options, argv, "autocost train", default=Options(train=train))
     use_compile_cache(options.compile_cache)
     # Before anything of JAX runs:
     group = (options.coordinator, options.num_processes, options.process_id)
     devices = use_devices(options.devices, *group)
     from autocost_jax.methods import Method, TableConfig, run_table
-    from autocost_jax.store import read_config
 
-    if options.resume:
-        config, _ = read_config(options.out, TableConfig)
+    if recorded is not None:
+        config = replace(recorded, train=options.train)
     else:
         theta = _theta(options.theta)
         config = TableConfig(
@@ -133,6 +133,24 @@ def _train(argv: list[str]) -> None:
         devices=devices,
         num_episodes=options.episodes,
     )
+
+
+def _train_defaults(argv: list[str], out: Path) -> tuple[Any, Any]:
+    """The recorded table on --resume, else None; and what other flags come on top of.
+
+    The latter is the `TrainConfig` of a preset, or on --resume without one the run's.
+    """
+    from autocost_jax.config import preset
+
+    name, recorded = flag(argv, "--preset"), None
+    if switch(argv, "--resume"):
+        from autocost_jax.methods import TableConfig
+        from autocost_jax.rundata import read_config
+
+        named = flag(argv, "--out")
+        recorded, _ = read_config(out if named is None else named, TableConfig)
+    source = preset(name or "laptop") if recorded is None or name else recorded
+    return recorded, with_env(source.train, argv)
 
 
 def _theta(path: Path | None) -> tuple[float, ...] | None:

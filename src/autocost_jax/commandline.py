@@ -44,13 +44,25 @@ def _first_sentence(panel: str) -> str:
 
 
 def flag(argv: Sequence[str], name: str) -> str | None:
-    """The value of a flag, before the flags are parsed."""
+    """The value of a flag, before the flags are parsed; the last one wins, as there."""
+    value = None
     for index, word in enumerate(argv):
         if word == name and index + 1 < len(argv):
-            return argv[index + 1]
-        if word.startswith(f"{name}="):
-            return word.partition("=")[2]
-    return None
+            value = argv[index + 1]
+        elif word.startswith(f"{name}="):
+            value = word.partition("=")[2]
+    return value
+
+
+def switch(argv: Sequence[str], name: str) -> bool:
+    """Whether a switch is on, before the flags are parsed; --no-NAME turns it off."""
+    words = {name: True, name.replace("--", "--no-", 1): False}
+    given = [words[word] for word in map(_hyphens, argv) if word in words]
+    return given[-1] if given else False
+
+
+def _hyphens(word: str) -> str:
+    return word.replace("_", "-")
 
 
 def with_env(train: TrainConfig, argv: Sequence[str]) -> TrainConfig:

@@ -37,6 +37,11 @@ class Fitness(struct.PyTreeNode):
     cost: jax.Array
     ep_return: jax.Array
 
+    @property
+    def finite(self) -> jax.Array:
+        """[P] bool, False where a candidate is broken."""
+        return jnp.isfinite(self.cost) & jnp.isfinite(self.ep_return)
+
 
 class ESState(struct.PyTreeNode):
     """What the search remembers between stages.
@@ -56,6 +61,10 @@ class ESState(struct.PyTreeNode):
 
 class Best(struct.PyTreeNode):
     """The final pick of a search.
+
+    There is none if nothing was told yet, or if a stage failed altogether, see
+    `failed_stage`. Then the candidate is NaN, its cost +inf and its return -inf, and
+    `generation` and `index` are -1.
 
     Attributes:
       candidate: pytree of the best candidate.
@@ -103,7 +112,7 @@ def rank(
     "An efficient constraint handling method for genetic algorithms"). Without it costs
     that make agents flee or stand still win, as they are the first to be safe.
     """
-    ok = jnp.isfinite(fitness.cost) & jnp.isfinite(fitness.ep_return)
+    ok = fitness.finite
     cost = jnp.where(fitness.cost <= zero_tolerance, 0.0, fitness.cost)
     cost = jnp.where(ok, cost, jnp.inf)
     loss = jnp.where(ok, -fitness.ep_return, jnp.inf)
@@ -438,6 +447,18 @@ def truncation_es(
     return ES(start, ask, tell)
 
 
+def failed_stage(state: ESState, population_size: int) -> jax.Array:
+    """The first stage told in which every candidate broke, [] int32; -1 without any.
+
+    Such a stage has nothing to select from: the search has failed, whatever was told
+    before or after it.
+    """
+    finite = state.archive_fitness.finite.reshape(-1, population_size)
+    alive = jnp.any(finite, axis=1)
+    failed = ~alive & (jnp.arange(alive.shape[0]) < state.generation)
+    return jnp.where(jnp.any(failed), jnp.argmax(failed), -1).astype(jnp.int32)
+
+
 def best(
     state: ESState,
     population_size: int,
@@ -448,14 +469,23 @@ def best(
 
     Without any, that of lowest cost; `zero_violation` says which it is. With a
     `return_floor` either of those that reach it; if none does, the highest return.
+    Of a failed search there is no pick, see `Best`.
     """
     fitness = state.archive_fitness
     index = rank(fitness, zero_tolerance, return_floor)[0]
+    is_failed = failed_stage(state, population_size) >= 0
+    found = fitness.finite[index] & ~is_failed
+
+    def pick(x: jax.Array) -> jax.Array:
+        is_float = jnp.issubdtype(x.dtype, jnp.floating)
+        return jnp.where(found, x[index], jnp.nan) if is_float else x[index]
+
+    place = jnp.where(found, index, -1).astype(jnp.int32)
     return Best(
-        candidate=jax.tree.map(lambda x: x[index], state.archive),
-        cost=fitness.cost[index],
-        ep_return=fitness.ep_return[index],
-        zero_violation=fitness.cost[index] <= zero_tolerance,
-        generation=(index // population_size).astype(jnp.int32),
-        index=(index % population_size).astype(jnp.int32),
+        candidate=jax.tree.map(pick, state.archive),
+        cost=jnp.where(found, fitness.cost[index], jnp.inf),
+        ep_return=jnp.where(found, fitness.ep_return[index], -jnp.inf),
+        zero_violation=found & (fitness.cost[index] <= zero_tolerance),
+        generation=place // population_size,  # of -1 it is -1
+        index=jnp.where(found, place % population_size, -1),
     )

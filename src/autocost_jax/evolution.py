@@ -106,7 +106,8 @@ class SearchResult(struct.PyTreeNode):
     """The outcome of the pure `search`.
 
     Attributes:
-      es: the final state of the strategy; `es.best` picks from its archive.
+      es: the final state of the strategy; `best_of` picks from its archive, and
+        raises if all candidates of a stage failed. (`es.best` is then NaN.)
       fitness: fields [S, P], S stages.
       scores: `TRACKED` metrics of each stage, each [S, A, P].
     """
@@ -350,18 +351,16 @@ def evolve(
 
     Raises:
       RuntimeError: after a stage, if all its candidates failed; it names the stage.
+        A state in which that has happened raises it again at once.
     """
     searcher = make_searcher(config) if searcher is None else searcher
     state = init_search(searcher) if state is None else state
+    require_survivors(config, state.es)
     while int(state.stage) < config.num_stages:
         state, progress = _run_chunk(searcher, state)
         yield state, progress
-        result = progress.result
-        if result is not None and not np.isfinite(result.fitness.cost).any():
-            raise RuntimeError(
-                f"every candidate of stage {progress.stage} failed "
-                "(non-finite numbers in all agents)"
-            )
+        if progress.result is not None:
+            require_survivors(config, state.es)
 
 
 def _begin_stage(searcher: Searcher, es_state: ESState, stage: int) -> SearchState:
@@ -421,8 +420,29 @@ def pick_label(config: SearchConfig, is_zero: bool, ep_return: float) -> str:
     return label if is_zero else f"{label} of those that return at least {floor:g}"
 
 
-def best_of(config: SearchConfig, state: ESState) -> Any:
-    """The search's final pick, `es.Best`."""
+def require_survivors(config: SearchConfig, state: ESState) -> None:
+    """Refuse to go on with a search, or to name its best, after a failed stage.
+
+    Raises:
+      RuntimeError: if all candidates of a stage failed; it names the stage.
+    """
+    stage = int(es_lib.failed_stage(state, config.population_size))
+    if stage >= 0:
+        raise RuntimeError(
+            f"every candidate of stage {stage} failed "
+            "(non-finite numbers in all agents)"
+        )
+
+
+def best_of(config: SearchConfig, state: ESState) -> es_lib.Best:
+    """The search's final pick.
+
+    Raises:
+      RuntimeError: if all candidates of a stage failed, or no stage was told yet.
+    """
+    require_survivors(config, state)
+    if not int(state.generation):
+        raise RuntimeError("the search has no best candidate before its first stage")
     return es_lib.best(
         state, config.population_size, config.zero_tolerance, config.return_floor
     )

@@ -20,6 +20,7 @@ from autocost_jax.commandline import (
     guarded,
     parse,
     quiet,
+    switch,
     use_compile_cache,
     use_devices,
     with_env,
@@ -118,7 +119,7 @@ def _defaults(argv: list[str]) -> Any:
         fail(f"{PROG}: unknown preset {name!r}; presets: {', '.join(PRESETS)}")
     config = preset(name)
     out, source = flag(argv, "--out"), flag(argv, "--config")
-    if source is None and "--resume" in argv and flag(argv, "--preset") is None:
+    if source is None and switch(argv, "--resume") and flag(argv, "--preset") is None:
         source = out
     if source is not None:
         from autocost_jax.store import read_config

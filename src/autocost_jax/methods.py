@@ -172,7 +172,8 @@ def run_table(
     """Train and evaluate a table in a run directory, or resume it.
 
     Args:
-      config: the table; on resume it must be the run's own.
+      config: the table; on resume it must be the run's own, but for
+        `rundata.MAY_DIFFER`.
       path: the run directory.
       resume: continue from the newest whole checkpoint.
       overwrite: start over in a directory that already holds a run.

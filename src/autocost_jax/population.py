@@ -28,6 +28,7 @@ from autocost_jax.train import (
     Learner,
     final_episodes,
     init_learner,
+    require_length,
     run_epoch,
     start_cohorts,
 )
@@ -47,7 +48,8 @@ class Population(NamedTuple):
         metrics [rounds, P_g] a group.
       chunk: (learners, slots, epoch) -> (learners, metrics [K, P_g] a group); the
         learners passed in are donated.
-      compile: (learners, slots) -> None, compiles `chunk` ahead of its first call.
+      compile: (learners, slots) -> the program of `chunk` for these shapes, compiled
+        ahead of its first call; `chunk` compiles any other shapes when they come.
       fetch: stacked pytree -> the same in the memory of every process.
       num_devices: devices it runs on.
     """
@@ -107,7 +109,11 @@ def make_population(
       bank: the cost terms.
       devices: default: the first device only.
       final_rounds: of `final`.
+
+    Raises:
+      ValueError: if the environment's episodes have another length than `config`'s.
     """
+    require_length(env, config)
     agents, bank = tuple(agents), tuple(bank)
     mesh = Mesh(np.asarray(devices or jax.devices()[:1]), (AXIS,))
     chunk_fn = _chunk_fn(env, agents, config, bank, mesh)
@@ -128,23 +134,21 @@ def make_population(
             check_vma=False,
         )
     )
-    compiled: dict[str, Any] = {}
+    compiled: dict[Any, Any] = {}  # by the shapes that it is for
 
     def init(slots: tuple[Slot, ...]) -> tuple[Learner, ...]:
         return _unpad(init_fn(_pad(slots, mesh)), _sizes(slots))
 
     def compile_(learners: tuple[Learner, ...], slots: tuple[Slot, ...]):
-        epoch = jnp.zeros((), jnp.int32)
-        lowered = chunk_fn.lower(_pad(learners, mesh), _pad(slots, mesh), epoch)
-        compiled["chunk"] = lowered.compile()
-        return compiled["chunk"]
+        inputs = (_pad(learners, mesh), _pad(slots, mesh))
+        program = chunk_fn.lower(*inputs, jnp.zeros((), jnp.int32)).compile()
+        compiled[_shapes(inputs)] = program
+        return program
 
     def chunk(learners: tuple[Learner, ...], slots: tuple[Slot, ...], epoch: int):
-        run = compiled.get("chunk", chunk_fn)
-        learners, metrics = run(
-            _pad(learners, mesh), _pad(slots, mesh), jnp.asarray(epoch, jnp.int32)
-        )
-        sizes = _sizes(slots)
+        inputs, sizes = (_pad(learners, mesh), _pad(slots, mesh)), _sizes(slots)
+        run = compiled.get(_shapes(inputs), chunk_fn)
+        learners, metrics = run(*inputs, jnp.asarray(epoch, jnp.int32))
         return _unpad(learners, sizes), _unpad_metrics(metrics, sizes)
 
     def final(learners: tuple[Learner, ...], slots: tuple[Slot, ...]):
@@ -232,6 +236,12 @@ def _sharded(fn: Callable, mesh: Mesh, spec: P) -> Callable:
 
 def _sizes(groups: tuple[Slot, ...]) -> list[int]:
     return [group.key.shape[0] for group in groups]
+
+
+def _shapes(tree: Any) -> Any:
+    """What a compiled program demands of its inputs, to look it up by."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
 
 
 def _pad(groups: tuple[Any, ...], mesh: Mesh) -> tuple[Any, ...]:

@@ -27,6 +27,7 @@ from autocost_jax.evolution import (
     init_search,
     make_searcher,
     pick_label,
+    require_survivors,
 )
 from autocost_jax.policies import (
     EVALUATION,
@@ -136,7 +137,8 @@ def run_search(
     """Run or resume a search and leave everything about it in a run directory.
 
     Args:
-      config: the search; on resume it must be the run's own.
+      config: the search; on resume it must be the run's own, but for
+        `rundata.MAY_DIFFER`.
       path: the run directory.
       resume: continue from the newest whole checkpoint.
       overwrite: start over in a directory that already holds a run.
@@ -227,6 +229,7 @@ def _start(
             done = f"{int(state.stage)} stages and {int(state.epoch)} epochs"
             display.say(f"resuming {run.path} after {done}")
             display.skip(_steps_done(run.config, state))
+            require_survivors(run.config, state.es)  # before anything is compiled
     hint = run.start_tensorboard(purge_step=step)
     if hint:
         display.say(hint)
@@ -307,6 +310,8 @@ def _write_stage(
     }
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     run.write_stage(progress.stage, arrays)
+    if not np.asarray(result.fitness.finite).any():
+        return  # no candidate is the best
     top = int(result.order[0])
     for name, learner in zip(config.algorithms, progress.learners, strict=True):
         policies = searcher.population.fetch(actor(learner.agent))

@@ -39,6 +39,8 @@ _PACKAGES = (
     "orbax-checkpoint",
     "numpy",
 )
+# Fields that say how a run is computed, not what: on resume they may be others.
+MAY_DIFFER = frozenset({"population_chunk"})
 _NON_FINITE = {"NaN": np.nan, "Infinity": np.inf, "-Infinity": -np.inf}
 
 
@@ -86,7 +88,10 @@ def config_hash(config: Any) -> str:
 
 
 def first_difference(old: Any, new: Any) -> tuple[str, Any, Any] | None:
-    """Name and both values of the first field in which two configs differ."""
+    """Name and both values of the first field in which two configs differ.
+
+    `MAY_DIFFER` names the fields that are not looked at.
+    """
     return _difference(to_dict(old), to_dict(new), "")
 
 
@@ -195,6 +200,8 @@ def to_json(value: Any) -> Any:
 def _difference(old: dict, new: dict, name: str) -> tuple[str, Any, Any] | None:
     for key in [*old, *(key for key in new if key not in old)]:
         a, b = old.get(key), new.get(key)
+        if key in MAY_DIFFER:
+            continue
         if isinstance(a, dict) and isinstance(b, dict):
             found = _difference(a, b, _join(name, key))
             if found is not None:

@@ -88,17 +88,19 @@ class RunDir:
 
     Attributes:
       path: the directory.
-      config: the run's configuration.
+      config: the run's configuration; of a resumed run as it is now asked for.
       facts: the facts recorded at its start.
       warnings: lines the user should see, from opening it.
     """
 
-    def __init__(self, path: Path, config: Any, facts: dict, lock: int) -> None:
+    def __init__(
+        self, path: Path, config: Any, facts: dict, lock: int, digest: str
+    ) -> None:
         self.path = path
         self.config = config
         self.facts = facts
         self.warnings: list[str] = []
-        self._hash = config_hash(config)
+        self._hash = digest  # of the recorded config, which its checkpoints carry
         self._lock = lock
         self._metrics: FileIO | None = None
         self._events: Any = None
@@ -138,7 +140,7 @@ class RunDir:
         except BaseException:
             os.close(lock)
             raise
-        return cls(path, config, facts, lock)
+        return cls(path, config, facts, lock, config_hash(config))
 
     @classmethod
     def open(cls, path: str | Path, config: Any = None) -> Self:
@@ -146,23 +148,25 @@ class RunDir:
 
         Args:
           path: the directory.
-          config: what the user asks for now; None takes the run's own.
+          config: what the user asks for now; None takes the run's own. It may differ
+            in `rundata.MAY_DIFFER`; the recorded one stays as it is.
 
         Raises:
           RunDirError: not a run, in use, or `config` is not the run's: the first
-            field that differs is named with both values.
+            other field that differs is named with both values.
         """
         path = Path(path)
         kind = SearchConfig if config is None else type(config)
         recorded, facts = read_config(path, kind)
-        difference = first_difference(recorded, config or recorded)
+        config = recorded if config is None else config
+        difference = first_difference(recorded, config)
         if difference is not None:
             name, old, new = difference
             raise RunDirError(
                 f"{path} was started with {name}={old}, asked for {name}={new}: "
                 "resume with the run's own configuration, or start a new run"
             )
-        run = cls(path, recorded, facts, _lock(path))
+        run = cls(path, config, facts, _lock(path), config_hash(recorded))
         for folder in (path, path / "checkpoints", path / "policies"):
             remove_temporaries(folder)
         changed = changed_facts(facts, run_facts())

@@ -36,6 +36,8 @@ def load_report(path: str | Path) -> ReportData:
     rows = read_metrics(path)
     stages = tuple(_stage(config, file) for file in list_stages(path).values())
     card = _read_card(path)
+    best = _best(config, stages, card)
+    evaluation = {} if best is None else card.get("evaluation", {})
     obstacle = config.train.env.constrained[0]
     return ReportData(
         title=f"AutoCost on {config.train.env.name}",
@@ -45,9 +47,9 @@ def load_report(path: str | Path) -> ReportData:
         obstacle=obstacle[:-1],
         obstacle_radius=getattr(config.train.env, f"{obstacle}_size"),
         stages=stages,
-        best=_best(config, stages, card),
+        best=best,
         curves=tuple(_curves(config, rows)),
-        replays=_replays(path, config),
+        replays=() if best is None else _replays(path, config),
         summary=tuple(
             SummaryRow(
                 algorithm=name,
@@ -58,7 +60,7 @@ def load_report(path: str | Path) -> ReportData:
                 seeds=1,
                 episodes=row["episodes"],
             )
-            for name, row in card.get("evaluation", {}).items()
+            for name, row in evaluation.items()
         ),
     )
 
@@ -105,8 +107,11 @@ def _known_mean(values: np.ndarray) -> np.ndarray:
 def _best(
     config: SearchConfig, stages: tuple[StageRecord, ...], card: dict[str, Any]
 ) -> BestCandidate | None:
-    """The card's pick; before there is one, the best of the finished stages."""
-    if not stages:
+    """The card's pick; before there is one, the best of the finished stages.
+
+    None if there is no stage yet, or one without a finite candidate.
+    """
+    if not stages or not all(stage.finite.any() for stage in stages):
         return None
     costs, returns = (
         np.concatenate([getattr(stage, name) for stage in stages])
@@ -114,8 +119,6 @@ def _best(
     )
     fitness = Fitness(jnp.asarray(costs), jnp.asarray(returns))
     first = int(rank(fitness, config.zero_tolerance, config.return_floor)[0])
-    if not np.isfinite([costs[first], returns[first]]).all():
-        return None
     number, index = divmod(first, config.population_size)
     number, index = card.get("stage", number), card.get("index", index)
     stage = stages[number]

@@ -51,6 +51,24 @@ def slot_key(slot: Slot, epoch: jax.Array | int, purpose: int) -> Key:
     return jax.random.fold_in(jax.random.fold_in(slot.key, epoch), purpose)
 
 
+def require_length(env: Env, config: TrainConfig) -> None:
+    """Refuse an environment whose episodes are not as long as the configuration's.
+
+    An epoch steps through the configuration's episode, and sums of an episode are
+    scaled by the environment's: two lengths would scale every cost and return.
+
+    Raises:
+      ValueError: naming both lengths.
+    """
+    length, wanted = env.episode_length, config.env.num_steps
+    if length != wanted:
+        raise ValueError(
+            f"the environment has episodes of {length} steps, the configuration of "
+            f"{wanted} (num_steps): make the environment from the configuration, "
+            "make_env(config.env), or set num_steps"
+        )
+
+
 def init_learner(agent: Agent, slot: Slot) -> Learner:
     """A fresh learner for one slot; vmap it for a group."""
     return Learner(
@@ -193,6 +211,9 @@ def train(
 
     Returns:
       The agent's state and metrics [num_epochs].
+
+    Raises:
+      ValueError: if the environment's episodes have another length than `config`'s.
     """
     slots = jax.tree.map(lambda x: x[None], slot)
     learners = jax.vmap(lambda slot: init_learner(agent, slot))(slots)
@@ -280,6 +301,7 @@ def _rollout(
     Returns the worlds after the epoch, and for each group what its slots saw: the
     trajectories [P_g, T, k N, ...] and the environment's counters [P_g, k N], float32.
     """
+    require_length(env, config)
 
     def keys(purpose: int) -> list[Key]:
         return [jax.vmap(lambda slot: slot_key(slot, epoch, purpose))(s) for s in slots]

@@ -179,7 +179,7 @@ class ReportData:
       obstacle: what must be avoided, as a word in the singular: "hazard".
       obstacle_radius: its radius, for the heat map.
       stages: the finished stages; empty while the first is running.
-      best: the result, or None if no stage has a finite candidate.
+      best: the result, or None if a stage has no finite candidate.
       curves: learning curves, any order.
       summary: how the best cost does beside the references, on fresh seeds; for each
         algorithm in the order of `COST_NAMES`.
