@@ -124,8 +124,10 @@ def test_the_wheel_would_hold_everything_that_is_read_at_run_time():
         ("benchmarks/population", "benchmarks/results/population_laptop"),
         ("benchmarks/population", "benchmarks/results/population_paper"),
         ("benchmarks/peers", "benchmarks/results/peers"),
-        ("experiments/main_job", "experiments/results/laptop/main_job"),
-        ("experiments/agreement", "experiments/results/agreement/agreement"),
+        (
+            "experiments/agreement",
+            "experiments/results/eight_hazards/agreement/agreement",
+        ),
     ],
 )
 def test_the_tables_are_those_of_the_committed_json(script, result):
