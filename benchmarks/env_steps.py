@@ -1,4 +1,4 @@
-"""How fast each of the twelve worlds steps, and how long it compiles.
+"""How fast each world of this project steps, and how long it compiles.
 
     python benchmarks/env_steps.py                     # all, batch 1024
     python benchmarks/env_steps.py --only Goal-Hazard-Car --batch 128 8192

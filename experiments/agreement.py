@@ -132,6 +132,7 @@ def collect_variant(path: Path) -> dict[str, Any]:
             }
     train = config.train
     return {
+        "env": train.env.name,
         "steps_a_slot": train.num_worlds * train.env.num_steps * len(rows),
         "seeds": list(config.seeds),
         "episodes": evaluated["episodes"],
@@ -189,6 +190,7 @@ def draw(result: dict[str, Any], file: Path) -> None:
         axes[0, column].set_title(algorithm.replace("_", "-"))
         axes[1, column].set_xlabel("epoch of 8000 steps (reduced scale)")
     axes[0, 0].legend(fontsize=8)
+    figure.suptitle(" and ".join({run["env"] for run in result["variants"].values()}))
     figure.tight_layout()
     figure.savefig(file, dpi=120)
     plt.close(figure)

@@ -12,12 +12,15 @@ already is taken from there.
 `--scale paper`; `reduced_2m` trains four times as long. `reduced_10m` has the paper's
 worlds and epochs with smaller networks and updates, and wants a GPU. `--smoke` shrinks
 everything to a minute. Runs can be stopped and started again.
+
+`--world Goal-Hazard8-Point` does the same in the crowded world of eight hazards, in
+folders of its own, with the costs that were found there.
 """
 
 import argparse
 import dataclasses
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,7 +35,8 @@ from autocost_jax.rundata import to_json
 from autocost_jax.store import read_config, read_metrics, run_facts
 
 RESULTS = Path("experiments/results")
-TRAINING_WORLD = "Goal-Hazard-Point"
+WORLD, CROWDED = "Goal-Hazard-Point", "Goal-Hazard8-Point"
+FOLDERS = {WORLD: WORLD, CROWDED: "eight_hazards"}  # of the worlds' runs and results
 BOTH: tuple[Algorithm, ...] = ("ppo_lagrangian", "cpo")
 NAMES = {"ppo": "PPO", "ppo_lagrangian": "PPO-Lag", "cpo": "CPO"}
 CURVES = ("ep_return", "ep_cost", "ep_total_cost")
@@ -45,22 +49,18 @@ class Design(NamedTuple):
       title: in legends and tables.
       cost: terms of the cost bank.
       limit: allowed cost of an episode.
-      theta: file of the intrinsic network's parameters, if `cost` uses it; `FOUND`
-        for `Scale.evolved`.
+      found: key of the intrinsic network in `Scale.found`, if `cost` uses one.
       algorithms: that are trained with it.
     """
 
     title: str
     cost: str = "extrinsic"
     limit: float = 0.0
-    theta: Path | str | None = None
+    found: str = ""
     algorithms: tuple[Learners, ...] = BOTH
 
 
-COSTS = RESULTS / "reduced" / "costs"
 WITH_NETWORK = "extrinsic+intrinsic"
-EVOLVED = "ic4srl_reduced"
-FOUND = "found"
 SEEDS = (0, 1, 2, 3, 4)
 DESIGNS: dict[str, Design] = {
     "unconstrained": Design("", algorithms=("ppo",)),
@@ -73,38 +73,65 @@ DESIGNS: dict[str, Design] = {
     "distance_change_indicator": Design("its indicator", "distance_change_indicator"),
     "margin_2x": Design("margin 2x", "safety_margin_2x"),
     "margin_3x": Design("margin 3x", "safety_margin_3x"),
-    "steep": Design("steep network", WITH_NETWORK, theta=COSTS / "steep"),
-    "evolved": Design("evolved", WITH_NETWORK, theta=FOUND),
-    "evolved_alone": Design("evolved, w/o extrinsic", "intrinsic", theta=FOUND),
-    "evolved_dense": Design("evolved, dense", WITH_NETWORK, theta="ic4srl_dense"),
-    "evolved_reduced": Design("evolved at 512,000", WITH_NETWORK, theta=EVOLVED),
+    "steep": Design("steep network", WITH_NETWORK, found="steep"),
+    "evolved": Design("evolved", WITH_NETWORK, found="evolved"),
+    "evolved_alone": Design("evolved, w/o extrinsic", "intrinsic", found="evolved"),
+    "evolved_dense": Design("evolved, dense", WITH_NETWORK, found="dense"),
+    "evolved_reduced": Design("evolved at 512,000", WITH_NETWORK, found="brief"),
+}
+
+# Costs that were made or searched for: by world and scale, files or names of the
+# package's. In the world of four hazards there is none yet.
+COSTS = RESULTS / FOLDERS[CROWDED] / "costs"
+BRIEF: dict[str, Path | str] = {
+    "steep": COSTS / "steep",
+    "evolved": COSTS / "lidar_mlp_8_brief",
+}
+LONG: dict[str, Path | str] = {
+    "steep": COSTS / "steep",
+    "evolved": "min_distance_8",
+    "dense": "lidar_mlp_8",
+    "brief": COSTS / "lidar_mlp_8_brief",
+}
+FOUND: dict[str, dict[str, dict[str, Path | str]]] = {
+    WORLD: {},
+    CROWDED: {
+        "reduced": BRIEF,
+        "reduced_2m": BRIEF,
+        "reduced_10m": LONG,
+        "paper": LONG,
+        "smoke": BRIEF,
+    },
 }
 
 
 class Scale(NamedTuple):
-    """How much of everything.
+    """How much of everything, and where.
 
     Attributes:
+      name: of `--scale`.
       train: sizes and the learners' settings, in any world.
       seeds: one slot each.
       episodes: fresh ones a policy is scored in.
       sizes: worlds a slot, epochs and episodes of slow worlds.
-      evolved: the cost that was searched for at this scale or the one below it.
+      world: of `FOLDERS`.
+      found: costs that were searched for in it, by `Design.found`.
     """
 
+    name: str
     train: TrainConfig
     seeds: tuple[int, ...] = SEEDS
     episodes: int = 200
-    sizes: dict[str, tuple[int, int, int]] = {}  # noqa: RUF012
-    evolved: str = EVOLVED
+    sizes: Mapping[str, tuple[int, int, int]] = {}
+    world: str = WORLD
+    found: Mapping[str, Path | str] = {}
 
 
-def scales() -> dict[str, Scale]:
+def scales(world: str = WORLD) -> dict[str, Scale]:
     """`reduced`: the laptop's update and 512,000 steps a slot, fewer in slow worlds.
 
     `reduced_2m` is four times as long. `reduced_10m` is the `search` preset's learner
-    with the paper's 333 epochs of 30 worlds, 9,990,000 steps a slot; `reduced_8m` stops
-    after 259 of them.
+    with the paper's 333 epochs of 30 worlds, 9,990,000 steps a slot.
     """
     laptop, smoke = preset("laptop").train, preset("smoke").train
     search = preset("search").train
@@ -112,21 +139,30 @@ def scales() -> dict[str, Scale]:
         "Goal-Pillar-Point": (4, 64, 200),
         "Push-Hazard-Point": (4, 32, 50),
         "Push-Pillar-Point": (4, 32, 25),
-        "Goal-Hazard-Car": (4, 64, 50),
-        "Goal-Hazard-Doggo": (4, 64, 50),
+        in_world("Goal-Hazard-Car", world): (4, 64, 50),
+        in_world("Goal-Hazard-Doggo", world): (4, 64, 50),
     }
-    slow_2m = {world: (n, 4 * t, episodes) for world, (n, t, episodes) in slow.items()}
+    slow_2m = {name: (n, 4 * t, episodes) for name, (n, t, episodes) in slow.items()}
     reduced = dataclasses.replace(laptop, num_epochs=64, chunk_epochs=4)
     longer = dataclasses.replace(reduced, num_epochs=256)
     longest = dataclasses.replace(search, num_epochs=333, chunk_epochs=37)
+    known = (
+        Scale("reduced", reduced, sizes=slow),
+        Scale("reduced_2m", longer, sizes=slow_2m),
+        Scale("reduced_10m", longest),
+        Scale("paper", preset("paper").train),
+        Scale("smoke", smoke, seeds=(0, 1), episodes=2),
+    )
+    found = FOUND[world]
     return {
-        "reduced": Scale(reduced, sizes=slow),
-        "reduced_2m": Scale(longer, sizes=slow_2m),
-        "reduced_8m": Scale(dataclasses.replace(longest, num_epochs=259)),
-        "reduced_10m": Scale(longest, evolved="ic4srl"),
-        "paper": Scale(preset("paper").train, evolved="ic4srl"),
-        "smoke": Scale(smoke, seeds=(0, 1), episodes=2),
+        scale.name: scale._replace(world=world, found=found.get(scale.name, {}))
+        for scale in known
     }
+
+
+def in_world(name: str, world: str) -> str:
+    """A Goal-Hazard world with as many hazards as `world` has; any other as it is."""
+    return name.replace("Goal-Hazard-", world.removesuffix("Point"))
 
 
 class Figure(NamedTuple):
@@ -137,7 +173,7 @@ class Figure(NamedTuple):
       title: what it shows.
       paper: what the paper reports.
       designs: keys of `DESIGNS`.
-      worlds: a column each.
+      worlds: a column each; see `in_world`.
       curves: a row each, keys of `CURVES`.
     """
 
@@ -145,14 +181,14 @@ class Figure(NamedTuple):
     title: str
     paper: str
     designs: tuple[str, ...]
-    worlds: tuple[str, ...] = (TRAINING_WORLD,)
+    worlds: tuple[str, ...] = (WORLD,)
     curves: tuple[str, ...] = ("ep_return", "ep_cost")
 
 
 def table(world: str, designs: Sequence[str], scale: Scale) -> TableConfig:
     """What is trained for some designs in one world."""
     env = env_config(world)
-    if world == TRAINING_WORLD:  # equal to MJX to rounding, and faster
+    if world in FOLDERS:  # equal to MJX to rounding, and faster
         env = dataclasses.replace(env, physics="closed_form")
     train, steps = scale.train, scale.train.env.num_steps
     worlds, epochs, _ = world_size(world, scale)
@@ -169,9 +205,8 @@ def table(world: str, designs: Sequence[str], scale: Scale) -> TableConfig:
 def methods(design: str, scale: Scale) -> tuple[Method, ...]:
     """A design's rows of a table."""
     cost, theta = DESIGNS[design], None
-    if cost.theta is not None:
-        file = scale.evolved if cost.theta == FOUND else cost.theta
-        theta = tuple(load_cost(file).tolist())
+    if cost.found:
+        theta = tuple(load_cost(scale.found[cost.found]).tolist())
     return tuple(
         Method(f"{design}-{name}", name, cost.cost, cost.limit, theta)
         for name in cost.algorithms
@@ -191,8 +226,11 @@ def steps_a_slot(train: TrainConfig) -> int:
 
 def run(figure: Figure, scale: Scale, runs: Path) -> None:
     """Train what the figure lacks, side by side in each world and size of network."""
+    without = [d for d in figure.designs if not exists(d, scale)]
+    if without:
+        print(f"no cost for {', '.join(without)} at {scale.name} in {scale.world} yet")
+    wanted = distinct(figure.designs, scale)
     for world in figure.worlds:
-        wanted = distinct(figure.designs, scale)
         missing = [d for d in wanted if find(runs, world, d, scale) is None]
         for designs in by_network(missing, scale):
             config = table(world, designs, scale)
@@ -213,9 +251,16 @@ def by_network(designs: Sequence[str], scale: Scale) -> list[list[str]]:
 
 
 def distinct(designs: Sequence[str], scale: Scale) -> list[str]:
-    """Designs without those that are another one at this scale."""
+    """The designs that exist, without those that are another one at this scale."""
+    designs = [design for design in designs if exists(design, scale)]
     contents = [[content(m) for m in methods(d, scale)] for d in designs]
     return [d for i, d in enumerate(designs) if contents[i] not in contents[:i]]
+
+
+def exists(design: str, scale: Scale) -> bool:
+    """Whether the cost of a design has been found at this scale in its world."""
+    key = DESIGNS[design].found
+    return not key or key in scale.found
 
 
 def content(method: Method) -> Method:
@@ -236,13 +281,9 @@ class Trained(NamedTuple):
 
 
 def find(runs: Path, world: str, design: str, scale: Scale) -> Trained | None:
-    """The finished run that holds a design, whatever else was trained in it.
-
-    It may be a round of `searches.py`.
-    """
+    """The finished run that holds a design, whatever else was trained in it."""
     wanted = table(world, [design], scale)
-    own, rounds = (sorted(d.glob("*/evaluation.json")) for d in (runs / world, runs))
-    for file in (*own, *rounds):
+    for file in sorted((runs / world).glob("*/evaluation.json")):
         config = read_config(file.parent, TableConfig)[0]
         labels = {content(method): method.label for method in config.methods}
         same = (config.train, config.seeds) == (wanted.train, wanted.seeds)
@@ -329,9 +370,8 @@ def upper_bound(rate: float, layouts: int) -> float:
     return float(beta.ppf(0.95, rate * layouts + 1, (1 - rate) * layouts))
 
 
-def collect(figure: Figure, scale_name: str, runs: Path, results: Path) -> None:
+def collect(figure: Figure, scale: Scale, runs: Path, results: Path) -> None:
     """Write the JSON, the table and the picture of whatever has been run."""
-    scale = scales()[scale_name]
     panels = {
         world: {
             design: scores(trained)
@@ -345,9 +385,10 @@ def collect(figure: Figure, scale_name: str, runs: Path, results: Path) -> None:
     result = {
         "title": figure.title,
         "paper": figure.paper,
-        "scale": scale_name,
-        "command": f"python experiments/{figure.name}.py run "
-        + ("--smoke" if scale_name == "smoke" else f"--scale {scale_name}"),
+        "world": scale.world,
+        "scale": scale.name,
+        "command": command(figure.name, scale),
+        "found": {name: str(cost) for name, cost in scale.found.items()},
         "seeds": list(scale.seeds),
         "facts": facts,
         "worlds": {world: panel for world, panel in panels.items() if panel},
@@ -357,6 +398,13 @@ def collect(figure: Figure, scale_name: str, runs: Path, results: Path) -> None:
     file.with_suffix(".md").write_text(render(result))
     draw(figure, result, file.with_suffix(".png"))
     print(file)
+
+
+def command(script: str, scale: Scale) -> str:
+    """What trains a figure."""
+    world = f"--world {scale.world} " if scale.world != WORLD else ""
+    size = "--smoke" if scale.name == "smoke" else f"--scale {scale.name}"
+    return f"python experiments/{script}.py run {world}{size}"
 
 
 def write(result: dict[str, Any], name: str, results: Path) -> Path:
@@ -484,8 +532,9 @@ def parser(
     )
     parser.add_argument("part", choices=tuple(parts))
     parser.add_argument("--scale", choices=scales, default="reduced")
+    parser.add_argument("--world", choices=FOLDERS, default=WORLD)
     parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--runs", type=Path, help="default: runs/figures/SCALE")
+    parser.add_argument("--runs", type=Path, help="default: runs/figures/WORLD/SCALE")
     parser.add_argument("--results", type=Path)
     return parser
 
@@ -494,8 +543,9 @@ def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """The parsed flags; devices and the compile cache are set up."""
     args = parser.parse_args()
     args.scale = "smoke" if args.smoke else args.scale
-    args.runs = args.runs or Path("runs/figures") / args.scale
-    where = args.runs / "results" if args.smoke else RESULTS / args.scale
+    folder = Path(FOLDERS[args.world]) / args.scale
+    args.runs = args.runs or "runs/figures" / folder
+    where = args.runs / "results" if args.smoke else RESULTS / folder
     args.results = args.results or where
     use_compile_cache(True)
     use_devices(None)  # a device a core, before anything of JAX runs
@@ -507,8 +557,11 @@ def main(figure: Figure, description: str | None) -> None:
     flags = parser(description)
     flags.add_argument("--only", nargs="+", choices=figure.worlds, help="what to run")
     args = arguments(flags)
+    scale = scales(args.world)[args.scale]
+    only = args.only if args.part == "run" and args.only else figure.worlds
+    worlds = tuple(in_world(name, args.world) for name in only)
+    figure = figure._replace(worlds=worlds)
     if args.part == "run":
-        figure = figure._replace(worlds=tuple(args.only or figure.worlds))
-        run(figure, scales()[args.scale], args.runs)
+        run(figure, scale, args.runs)
     else:
-        collect(figure, args.scale, args.runs, args.results)
+        collect(figure, scale, args.runs, args.results)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 ALGORITHMS = ("ppo", "ppo_lagrangian", "cpo")
-KINDS = ("Goal-Hazard", "Goal-Pillar", "Push-Hazard", "Push-Pillar")
+KINDS = ("Goal-Hazard", "Goal-Hazard8", "Goal-Pillar", "Push-Hazard", "Push-Pillar")
 ROBOTS = ("Point", "Car", "Doggo")
 
 
@@ -185,6 +185,7 @@ def draw_limit(tables: dict[str, Any], file: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 5.5), layout="constrained")
+    figure.suptitle(tables["limit25"]["env"], fontsize=9)
     axes = figure.subplots(2, 3)
     for cost, run in zip(axes[0], tables.values(), strict=False):
         band(cost, run, "ep_cost")

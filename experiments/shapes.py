@@ -128,7 +128,7 @@ def slot(shape: Shape, seed: int) -> Slot:
 
 def train(shapes: Sequence[Shape], scale: paper.Scale) -> Iterator[dict[str, Any]]:
     """Train shapes side by side; a row of scores each, [seeds] for both algorithms."""
-    config = paper.table(paper.TRAINING_WORLD, ["extrinsic"], scale).train
+    config = paper.table(scale.world, ["extrinsic"], scale).train
     env = make_env(config.env)
     agents = make_agents(paper.BOTH, config, env)
     group = stack_slots([slot(shape, seed) for shape in shapes for seed in SEEDS])
@@ -161,7 +161,8 @@ def trained(runs: Path) -> dict[Shape, dict[str, Any]]:
 
 def run(args: argparse.Namespace) -> None:
     """Train what is missing, some shapes at a time."""
-    scale, known = paper.scales()[args.scale], TRIED[:2] if args.smoke else TRIED
+    scale = paper.scales(args.world)[args.scale]
+    known = TRIED[:2] if args.smoke else TRIED
     done = trained(args.runs)
     missing = [shape for shape in known if shape not in done]
     facts = run_facts()
@@ -177,11 +178,13 @@ def collect(args: argparse.Namespace) -> None:
     """JSON, table and picture."""
     rows = list(trained(args.runs).values())
     facts = {json.dumps(row.pop("facts"), sort_keys=True) for row in rows}
-    config = paper.scales()[args.scale].train
+    scale = paper.scales(args.world)[args.scale]
+    config = scale.train
     result = {
         "title": "Shapes of a cost by hand",
-        "scale": args.scale,
-        "command": f"python experiments/shapes.py run --scale {args.scale}",
+        "world": scale.world,
+        "scale": scale.name,
+        "command": paper.command("shapes", scale),
         "steps_a_slot": paper.steps_a_slot(config),
         "seeds": list(SEEDS),
         "episodes": config.num_worlds * min(LAST, config.num_epochs) * len(SEEDS),
@@ -207,7 +210,7 @@ def render(result: dict[str, Any]) -> str:
     columns = ("return", "cost", "violating")
     heads = [f"{paper.NAMES[a]}: {column}" for a in paper.BOTH for column in columns]
     lines = [
-        f"Goal-Hazard-Point ({caption(result)})",
+        f"{result['world']} ({caption(result)})",
         "",
         f"| shape | {' | '.join(heads)} |",
         "|---" * (1 + len(heads)) + "|",
@@ -245,7 +248,7 @@ def draw(result: dict[str, Any], file: Path, margins: Path) -> None:
                         fillstyle="full" if is_plain else "none",
                         label=kind if is_plain else f"{kind}: height, limit, constant",
                     )
-        for design, score in fresh_scores(margins, algorithm):
+        for design, score in fresh_scores(margins, result["world"], algorithm):
             panel.plot(
                 score["return"]["mean"],
                 100 * score["violation_rate"],
@@ -261,18 +264,23 @@ def draw(result: dict[str, Any], file: Path, margins: Path) -> None:
     panels[0].set_ylabel("violating episodes, %")
     lines, names = panels[0].get_legend_handles_labels()
     picture.legend(lines, names, fontsize=6, ncols=4, loc="outside lower center")
-    text = f"{result['title']}\n{caption(result)}; black: 5 seeds, fresh episodes"
+    text = (
+        f"{result['title']}, {result['world']}\n{caption(result)}; black: 5 seeds, "
+        "fresh episodes"
+    )
     picture.suptitle(text, fontsize=8)
     picture.savefig(file, dpi=130)
 
 
-def fresh_scores(margins: Path, algorithm: str) -> list[tuple[str, dict[str, Any]]]:
+def fresh_scores(
+    margins: Path, world: str, algorithm: str
+) -> list[tuple[str, dict[str, Any]]]:
     """Scores of the designs of `MARKERS` over fresh episodes, if there are any."""
     if not margins.exists():
         return []
-    world = json.loads(margins.read_text())["worlds"][paper.TRAINING_WORLD]
-    known = [design for design in MARKERS if design in world]
-    return [(design, world[design]["algorithms"][algorithm]) for design in known]
+    panel = json.loads(margins.read_text())["worlds"].get(world, {})
+    known = [design for design in MARKERS if design in panel]
+    return [(design, panel[design]["algorithms"][algorithm]) for design in known]
 
 
 PARTS = {"run": run, "collect": collect}

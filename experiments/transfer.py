@@ -43,17 +43,19 @@ def run(runs: Path, python: Path, scale: paper.Scale, episodes: int) -> None:
         for method, label in found.labels.items():
             for seed in scale.seeds:
                 policy = found.path / "policies" / f"{label}_seed{seed}.npz"
-                scores = play(python, policy, env_config(world).robot, episodes, seed)
+                scores = play(python, policy, world, episodes, seed)
                 rows.append({"method": method, "seed": seed} | scores)
                 print(world, label, seed, np.mean(scores["return"]), flush=True)
         write_atomic(file, json.dumps(rows).encode())
 
 
 def play(
-    python: Path, policy: Path, robot: str, episodes: int, seed: int
+    python: Path, policy: Path, world: str, episodes: int, seed: int
 ) -> dict[str, Any]:
     """Return and cost of each episode there."""
-    words = [str(python), str(SCRIPT), str(policy), robot, str(episodes), str(seed)]
+    env = env_config(world)
+    numbers = [str(number) for number in (env.hazards_num, episodes, seed)]
+    words = [str(python), str(SCRIPT), str(policy), env.robot, *numbers]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{policy}: {done.stderr.strip()[-500:]}")
@@ -62,7 +64,9 @@ def play(
 
 def trained(runs: Path, scale: paper.Scale) -> list[tuple[str, str, paper.Trained]]:
     """World, design and run of what has been trained."""
-    names = [(world, design) for world in WORLDS for design in DESIGNS]
+    worlds = [paper.in_world(world, scale.world) for world in WORLDS]
+    designs = [design for design in DESIGNS if paper.exists(design, scale)]
+    names = [(world, design) for world in worlds for design in designs]
     found = [(w, d, paper.find(runs, w, d, scale)) for w, d in names]
     return [(w, d, run) for w, d, run in found if run is not None]
 
@@ -113,10 +117,10 @@ def rate_difference(a: int, of_a: int, b: int, of_b: int) -> dict[str, float]:
     return {"mean": p - q, "low": float(low), "high": float(high)}
 
 
-def collect(runs: Path, results: Path, scale: str) -> None:
+def collect(runs: Path, results: Path, scale: paper.Scale) -> None:
     """Write the JSON and the table."""
     rows = []
-    for world, design, found in trained(runs, paper.scales()[scale]):
+    for world, design, found in trained(runs, scale):
         if not played(found, design).exists():
             continue
         theirs = json.loads(played(found, design).read_text())
@@ -135,8 +139,9 @@ def collect(runs: Path, results: Path, scale: str) -> None:
     facts.pop("seed")
     result = {
         "title": "Policies in Safety-Gymnasium 1.0.0 (MuJoCo 2.3.3) and here",
-        "command": "python experiments/transfer.py run",
-        "scale": scale,
+        "command": paper.command("transfer", scale),
+        "world": scale.world,
+        "scale": scale.name,
         "facts": facts,
         "rows": rows,
     }
@@ -177,8 +182,8 @@ if __name__ == "__main__":
     parser = paper.parser(__doc__)
     parser.add_argument("--python", type=Path, default=PYTHON)
     args = paper.arguments(parser)
+    scale = paper.scales(args.world)[args.scale]
     if args.part == "run":
-        scale = paper.scales()[args.scale]
         run(args.runs, args.python, scale, 1 if args.smoke else EPISODES)
     else:
-        collect(args.runs, args.results, args.scale)
+        collect(args.runs, args.results, scale)

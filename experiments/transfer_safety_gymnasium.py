@@ -1,11 +1,11 @@
 """An exported policy in Safety-Gymnasium: NumPy and its own engine, nothing of ours.
 
-    python experiments/transfer_safety_gymnasium.py POLICY.npz Point 20 0
+    python experiments/transfer_safety_gymnasium.py POLICY.npz Point 4 20 0
 
 Needs an interpreter with safety-gymnasium 1.0.0 (Python 3.10). The Goal-Hazard world
-of this project is set up by Safety-Gymnasium's own task: eight hazards of 0.3 m,
-keepouts 0.4 m, extents 2 m, lidars of 8 exponential bins, depth as cost. Prints one
-line of JSON: return and cost of each episode.
+of this project is set up by Safety-Gymnasium's own task: here 4 hazards of 0.3 m,
+keepouts 0.4 m, extents 2 m, lidars of 8 exponential bins, depth as cost. 20 episodes
+with seed 0. Prints one line of JSON: return and cost of each episode.
 """
 
 import json
@@ -21,20 +21,25 @@ from safety_gymnasium.tasks.safe_navigation.goal.goal_level0 import GoalLevel0
 
 
 class GoalHazard(GoalLevel0):
-    """Goal-Hazard as this project's default."""
+    """Goal-Hazard as this project's default, with `hazards` of them."""
+
+    hazards = 4
 
     def __init__(self, config: dict[str, Any]) -> None:
         BaseTask.__init__(self, config=config)
         self.placements_conf.extents = [-2, -2, 2, 2]
-        self._add_geoms(Goal(keepout=0.4), Hazards(num=8, size=0.3, keepout=0.4))
+        self._add_geoms(
+            Goal(keepout=0.4), Hazards(num=self.hazards, size=0.3, keepout=0.4)
+        )
         self.lidar_conf.num_bins = 8
         self.lidar_conf.max_dist = None  # exponential
         self.cost_conf.constrain_indicator = False
         self.last_dist_goal = None
 
 
-def make(robot: str) -> Builder:
+def make(robot: str, hazards: int) -> Builder:
     """The world, with observations by name."""
+    GoalHazard.hazards = hazards
     safety_gymnasium.tasks.GoalLevel1 = GoalHazard  # where the builder looks it up
     config = {"agent_name": robot, "observation_flatten": False}
     return Builder(f"Safety{robot}Goal1-v0", config=config)
@@ -51,11 +56,13 @@ def act(policy: dict[str, np.ndarray], obs: Any, rng: np.random.Generator) -> An
     return x + np.exp(policy["log_std"]) * rng.standard_normal(x.shape)
 
 
-def play(path: str, robot: str, episodes: int, seed: int) -> dict[str, list[float]]:
+def play(
+    path: str, robot: str, hazards: int, episodes: int, seed: int
+) -> dict[str, list[float]]:
     """Whole episodes: their returns and costs."""
     with np.load(path, allow_pickle=False) as file:
         policy = {name: file[name].astype(np.float64) for name in file.files}
-    env, rng = make(robot), np.random.default_rng(seed)
+    env, rng = make(robot, hazards), np.random.default_rng(seed)
     result: dict[str, list[float]] = {"return": [], "cost": []}
     for episode in range(episodes):
         obs, _ = env.reset(seed=1000 * seed + episode)
@@ -71,5 +78,5 @@ def play(path: str, robot: str, episodes: int, seed: int) -> dict[str, list[floa
 
 
 if __name__ == "__main__":
-    file, robot, episodes, seed = sys.argv[1:]
-    print(json.dumps(play(file, robot, int(episodes), int(seed))))
+    file, robot, *numbers = sys.argv[1:]
+    print(json.dumps(play(file, robot, *map(int, numbers))))

@@ -203,8 +203,7 @@ def test_round_trip(tmp_path, name):
 
 
 def test_costs_of_the_package_load_by_name(tmp_path, monkeypatch):
-    dense, nearest = ("ic4srl_dense", "ic4srl_reduced"), ("ic4srl", "ic4srl_nearest")
-    sizes = dict.fromkeys(dense, 41) | dict.fromkeys(nearest, 13)
+    sizes = {"lidar_mlp_8": 41, "min_distance_8": 13}
     assert set(list_costs()) == set(sizes)
     for name in list_costs():
         theta = load_cost(name)
@@ -212,13 +211,14 @@ def test_costs_of_the_package_load_by_name(tmp_path, monkeypatch):
         assert bool(jnp.isfinite(theta).all())
         card = cost_card(name)
         assert {"found", "budget", "validation", "fails"} <= set(card)
+        assert card["environment"] == "Goal-Hazard8-Point"
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match="a cost of the package"):
-        save_cost("ic4srl_reduced", np.ones(41), {})
-    save_cost("./ic4srl_reduced", np.ones(41), {})
-    assert sorted(os.listdir(tmp_path)) == ["ic4srl_reduced.json", "ic4srl_reduced.npz"]
-    assert not bool((load_cost("ic4srl_reduced") == 1).all())
-    assert bool((load_cost("./ic4srl_reduced.npz") == 1).all())
+        save_cost("lidar_mlp_8", np.ones(41), {})
+    save_cost("./lidar_mlp_8", np.ones(41), {})
+    assert sorted(os.listdir(tmp_path)) == ["lidar_mlp_8.json", "lidar_mlp_8.npz"]
+    assert not bool((load_cost("lidar_mlp_8") == 1).all())
+    assert bool((load_cost("./lidar_mlp_8.npz") == 1).all())
 
 
 def test_a_missing_card_is_named(tmp_path):

@@ -1,6 +1,5 @@
 """The figures of the paper: what is trained, how it is counted, and one end to end."""
 
-import argparse
 import dataclasses
 import json
 import re
@@ -11,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax import cost_card, load_cost, preset
+from autocost_jax import preset
 from autocost_jax.costs import total_cost
 from autocost_jax.env_config import ENVS
-from autocost_jax.methods import Method, TableConfig
 from autocost_jax.records import CostInputs
 from autocost_jax.store import RunDir
 from scripts import ROOT, load_script
@@ -33,11 +31,9 @@ FIGURES = (
 common = load_script("experiments/common")
 computing_time = load_script("experiments/computing_time")
 paper = load_script("experiments/paper")
-searches = load_script("experiments/searches")
-searches_tables = load_script("experiments/searches_tables")
 shapes = load_script("experiments/shapes")
 transfer = load_script("experiments/transfer")
-PLAN = searches.PLANS["smoke"]
+CROWDED = ROOT / "experiments" / "results" / "eight_hazards"
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -52,13 +48,13 @@ def test_a_figure_names_itself_and_what_exists(name):
 
 @pytest.mark.parametrize("design", paper.DESIGNS)
 def test_a_design_is_trained_by_both_algorithms_with_every_seed(design):
-    scale = paper.scales()["reduced"]
+    scale = paper.scales("Goal-Hazard8-Point")["reduced_10m"]
     config = paper.table("Goal-Pillar-Point", [design], scale)
     cost = paper.DESIGNS[design]
     assert config.seeds == (0, 1, 2, 3, 4)
     assert {method.algorithm for method in config.methods} == set(cost.algorithms)
     assert {method.limit for method in config.methods} == {cost.limit}
-    assert all((m.theta is None) == (cost.theta is None) for m in config.methods)
+    assert all((m.theta is None) == (not cost.found) for m in config.methods)
     assert config.train.env.physics == "reduced"
 
 
@@ -73,19 +69,12 @@ def test_the_scale_of_the_paper_is_its_preset():
 def test_a_longer_scale_differs_in_epochs_alone():
     short, long = (paper.scales()[name] for name in ("reduced", "reduced_2m"))
     for world in ("Goal-Hazard-Point", "Goal-Hazard-Car"):
-        configs = [paper.table(world, ["steep"], scale) for scale in (short, long)]
+        configs = [paper.table(world, ["margin_2x"], scale) for scale in (short, long)]
         epochs = 4 * configs[0].train.num_epochs
         train = dataclasses.replace(configs[0].train, num_epochs=epochs)
         assert dataclasses.replace(configs[0], train=train) == configs[1]
     assert paper.world_size("Goal-Hazard-Point", short) == (8, 64, 200)
     assert paper.world_size("Goal-Hazard-Car", long) == (4, 256, 50)
-
-
-def test_a_design_that_is_another_one_at_a_scale_is_left_out():
-    designs = ["steep", "evolved", "evolved_reduced"]
-    reduced, long = (paper.scales()[name] for name in ("reduced", "reduced_10m"))
-    assert paper.distinct(designs, reduced) == ["steep", "evolved"]
-    assert paper.distinct(designs, long) == designs
 
 
 def test_the_longest_reduced_scale_has_the_steps_of_the_paper():
@@ -98,22 +87,71 @@ def test_the_longest_reduced_scale_has_the_steps_of_the_paper():
     assert trains[0].agent == preset("search").train.agent  # smaller
 
 
-def test_the_tables_of_the_readme_are_those_of_the_results():
-    text = (ROOT / "experiments" / "README.md").read_text()
-    blocks = re.findall(
-        r"<!-- (reduced\w*/\w+) -->\n(.*?)<!-- end -->", text, re.DOTALL
+def test_designs_are_those_whose_costs_were_found_in_the_world():
+    """Without those that are another one at the same scale."""
+    designs = ["extrinsic", "steep", "evolved", "evolved_dense", "evolved_reduced"]
+    crowded = paper.scales("Goal-Hazard8-Point")
+    assert paper.distinct(designs, paper.scales()["reduced"]) == ["extrinsic"]
+    assert paper.distinct(designs, crowded["reduced"]) == designs[:3]
+    assert paper.distinct(designs, crowded["reduced_10m"]) == designs
+    same = crowded["reduced"]._replace(
+        found=dict.fromkeys(("evolved", "brief"), "lidar_mlp_8")
     )
-    assert {name for name, _ in blocks} >= {"reduced/evolution", "reduced/margins"}
-    for name, shown in blocks:
-        file = ROOT / "experiments" / "results" / f"{name}.json"
-        result = json.loads(file.read_text())
-        render = {
-            "evolution": searches_tables.render,
-            "shapes": shapes.render,
-            "transfer": transfer.render,
-        }
-        expect = render.get(file.stem, paper.render)(result)
-        assert shown.strip() == expect.strip(), name
+    assert paper.distinct(["evolved", "evolved_reduced"], same) == ["evolved"]
+
+
+def test_the_crowded_world_has_eight_hazards_and_is_otherwise_the_same():
+    for robot in ("Point", "Car"):
+        name = f"Goal-Hazard-{robot}"
+        assert paper.in_world(name, "Goal-Hazard-Point") == name
+        crowded = paper.in_world(name, "Goal-Hazard8-Point")
+        assert crowded == f"Goal-Hazard8-{robot}"
+        plain, full = (
+            paper.table(world, ["extrinsic"], paper.scales(training)["reduced"])
+            for world, training in ((name, paper.WORLD), (crowded, paper.CROWDED))
+        )
+        env = dataclasses.replace(full.train.env, hazards_num=4)
+        train = dataclasses.replace(full.train, env=env)
+        assert full.train.env.hazards_num == 8
+        assert dataclasses.replace(full, train=train) == plain
+    for name in ("Push-Hazard-Point", "Goal-Pillar-Point"):
+        assert paper.in_world(name, "Goal-Hazard8-Point") == name
+
+
+@pytest.mark.parametrize("world", ["Goal-Hazard-Point", "Goal-Hazard8-Point"])
+def test_each_world_has_folders_of_its_own(world, monkeypatch):
+    words = ["x.py", "collect", "--scale", "reduced_10m", "--world", world]
+    monkeypatch.setattr(sys, "argv", words)
+    monkeypatch.setattr(paper, "use_devices", lambda number: None)
+    monkeypatch.setattr(paper, "use_compile_cache", lambda on: None)
+    args = paper.arguments(paper.parser(None))
+    folder = "eight_hazards" if "8" in world else world
+    assert args.results.parts[-2:] == args.runs.parts[-2:] == (folder, "reduced_10m")
+
+
+def test_what_was_measured_with_eight_hazards_says_so():
+    files = [*CROWDED.rglob("*.json"), *CROWDED.rglob("*.md")]
+    assert len(files) > 20
+    for file in files:
+        assert "Goal-Hazard-" not in file.read_text(), file
+
+
+def test_tables_are_those_of_the_results_beside_them():
+    others = {"shapes": shapes.render, "transfer": transfer.render}
+    files = (ROOT / "experiments" / "results").glob("*/*/*.json")
+    known = [file for file in files if file.stem in (*FIGURES, *others)]
+    assert {file.stem for file in known} == {*FIGURES, *others}
+    for file in known:
+        expect = others.get(file.stem, paper.render)(json.loads(file.read_text()))
+        assert file.with_suffix(".md").read_text() == expect, file
+
+
+def test_files_that_the_page_of_the_experiments_shows_exist():
+    page = ROOT / "experiments" / "README.md"
+    links = re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text())
+    assert len(links) > 10
+    for link in links:
+        assert (page.parent / link).exists(), link
 
 
 def test_computing_times_are_steps_over_rate_and_updates(tmp_path):
@@ -161,10 +199,7 @@ def test_the_table_of_computing_times_is_that_of_the_benchmarks():
     result = computing_time.collect(ROOT / "benchmarks" / "results")
     file = ROOT / "experiments" / "results" / "computing_time.json"
     assert json.loads(file.read_text()) == json.loads(json.dumps(result))
-    text = (ROOT / "experiments" / "README.md").read_text()
-    shown = re.search(r"<!-- computing_time -->\n(.*?)<!-- end -->", text, re.DOTALL)
-    assert shown is not None
-    assert shown[1].strip() == computing_time.render(result).strip()
+    assert file.with_suffix(".md").read_text() == computing_time.render(result)
 
 
 def row(ep_return, cost, violating, episodes=100):
@@ -236,125 +271,10 @@ def test_a_run_of_another_cost_is_not_taken_for_this_one(tmp_path):
         common.check_same(new, tmp_path / "run")
 
 
-def write_search(runs, costs, returns):
-    """A finished search of two stages; candidate 1 of the first is trained again."""
-    config = dataclasses.replace(preset("smoke"), seed=0)
-    theta = np.arange(8 * 41, dtype=np.float32).reshape(2, 4, 41)
-    theta[1, 0] = theta[0, 1]
-    near = np.array([[0.0, 0.02, 0.03, 0.4], [0.004, 0.06, 0.05, 0.6]])  # [A, P]
-    with RunDir.create(searches.folder(runs, "guided", 0), config) as run:
-        for stage in range(2):
-            run.write_stage(
-                stage,
-                {
-                    "theta": theta[stage],
-                    "cost": np.float32(costs[stage]),
-                    "ep_return": np.float32(returns[stage]),
-                    "scores/intrinsic_near": near,
-                    "scores/ep_cost": np.tile(np.float32(costs[stage]), (2, 1)),
-                    "scores/ep_return": np.tile(np.float32(returns[stage]), (2, 1)),
-                },
-            )
-        run.write_cost({"theta": theta[0, 0]}, {"search_cost": 0.0})
-    return theta
-
-
-def write_round(runs, index, scores):
-    """Scores of each entrant, (return, cost, violating of 100) by algorithm."""
-    methods, rows = [], []
-    for i, row_of in enumerate(searches.entrants(runs, PLAN, index)):
-        theta = tuple(row_of["theta"].tolist())
-        for algorithm, score in zip(paper.BOTH, scores[i], strict=True):
-            label = f"{i}-{algorithm}"
-            methods.append(Method(label, algorithm, paper.WITH_NETWORK, 0.0, theta))
-            rows.append({"method": label, "seed": 100} | row(*score))
-    config = TableConfig(preset("smoke").train, tuple(methods), (100,))
-    with RunDir.create(runs / PLAN.rounds[index].name, config) as run:
-        run.write_json("evaluation", {"episodes": 100, "rows": rows})
-
-
-def test_the_shipped_cost_is_the_best_useful_one_of_the_last_round(tmp_path):
-    """Timid candidates come last, one that was trained twice counts by its mean."""
-    costs = [[0.0, 1.0, 0.5, 9.0], [3.0, 4.0, 5.0, 6.0]]
-    returns = [[-3.0, 5.0, 1.0, 9.0], [7.0, 6.0, 5.0, 4.0]]
-    runs = tmp_path / "runs"
-    theta = write_search(runs, costs, returns)
-    ranked = searches.candidates(runs, PLAN, PLAN.rounds[0])
-    assert [row["index"] for row in ranked] == [1, 1, 2, 3, 3, 2, 0]
-    assert (ranked[0]["cost"], ranked[0]["times_trained"]) == (2.0, 2)
-    worse = [[(9.0, 4.0 + i, 60)] * 2 for i in range(5)]
-    write_round(runs, 0, [worse[0], *[[(3.0, 2.0, 50)] * 2] * 2, *worse[1:]])
-    found = searches.entrants(runs, PLAN, 1)
-    assert [row["index"] for row in found] == [1, 2, 1, 3]
-    timid, best = [(1.0, 0.0, 0)] * 2, [(4.0, 0.1, 3), (3.0, 0.0, 0)]
-    write_round(runs, 1, [timid, best, *worse[:2]])
-    args = argparse.Namespace(runs=runs, results=tmp_path, smoke=True, scale="smoke")
-    searches.ship(args)
-    shipped = load_cost(tmp_path / "costs" / "ic4srl_reduced")
-    np.testing.assert_array_equal(shipped, found[1]["theta"])
-    np.testing.assert_array_equal(found[1]["theta"], theta[1, 2])
-    card = cost_card(tmp_path / "costs" / "ic4srl_reduced")
-    assert card["fails"] == "not free of violations under PPO-Lag"
-    assert card["validation"]["cpo"]["violation_rate_upper"] > 0
-    others = (tmp_path / "costs").glob("ic4srl_reduced_runner_up_*.npz")
-    assert len(list(others)) == 3
-    searches.collect(args)
-    table = (tmp_path / "evolution.md").read_text()
-    assert "| guided, 0 | 2.62, 4.50 | 0.00, 3.00 |" in table
-    assert "| 0.003 to 0.01 |" not in table
-    assert "| 0.03 to 0.1 | 4 | 2.6 | 4.2 |" in table
-    assert "| 0.3 to 1.0 | 2 | 7.5 | 6.5 |" in table
-    assert "| shortlist |" in table
-    assert "| validation |" in table
-    assert (tmp_path / "heat_map_ic4srl_reduced.png").exists()
-    assert (tmp_path / "evolution.png").exists()
-
-
-def test_runners_up_follow_from_the_round_before(tmp_path):
-    """One cost is validated; who came behind it is known from the shortlist."""
-    runs = tmp_path / "runs"
-    write_search(runs, [[1.0, 2.0, 3.0, 4.0]] * 2, [[5.0] * 4] * 2)
-    first = PLAN.rounds[0]._replace(entrants=3)
-    last = PLAN.rounds[1]._replace(entrants=1)
-    plan = PLAN._replace(rounds=(first, last))
-    scores = [[(5.0, cost, 9)] * 2 for cost in (0.3, 0.1, 0.2, 0.4, 0.5, 0.6, 0.7)]
-    write_round(runs, 0, scores)
-    order = [row["index"] for row in searches.scored(runs, plan, 0)]
-    write_round(runs, 1, scores)
-    rows = searches.placed(runs, plan, 1)
-    assert [row["index"] for row, _ in rows] == order
-    assert [part.name for _, part in rows] == ["validation", "shortlist", "shortlist"]
-
-
-def test_rounds_wait_for_their_searches(tmp_path, capsys):
-    args = argparse.Namespace(runs=tmp_path, smoke=True, scale="smoke")
-    searches.validate(args)
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(PLAN.rounds)
-    assert lines[0] == "shortlist: no finished search by guided or paper or raw"
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_worse_of_two_agents_can_decide(tmp_path):
-    """The best by the mean has an agent that flees, another a costly one."""
-    runs = tmp_path / "runs"
-    costs = [[0.0, 1.0, 0.5, 9.0], [3.0, 4.0, 5.0, 6.0]]
-    write_search(runs, costs, [[5.0, 5.0, 5.0, 9.0], [7.0, 6.0, 5.0, 4.0]])
-    scores = [[(9.0, 0.9, 60), (-3.0, 0.0, 0)], [(4.0, 0.5, 9), (3.0, 0.6, 9)]]
-    scores += [[(9.0, 1.0, 60), (9.0, 0.0, 60)]] + [[(9.0, 5.0, 60)] * 2] * 4
-    write_round(runs, 0, scores)
-    first = searches.entrants(runs, PLAN, 0)
-    for judge, expect in (("mean", [0, 2, 1]), ("worst", [1, 2, 3])):
-        plan = PLAN._replace(rounds=(PLAN.rounds[0]._replace(judge=judge),))
-        ranked = searches.scored(runs, plan, 0)[:3]
-        assert [row["theta"].tolist() for row in ranked] == [
-            first[i]["theta"].tolist() for i in expect
-        ]
-
-
 def test_a_design_is_found_in_whatever_table_it_was_trained(tmp_path):
     """By what was trained: not by its label, nor with another cost or size."""
-    scale, world = paper.scales()["smoke"], "Goal-Hazard-Point"
+    world = "Goal-Hazard8-Point"
+    scale = paper.scales(world)["smoke"]
     config = paper.table(world, ["extrinsic", "steep", "unconstrained"], scale)
     old = dataclasses.replace(config.methods[0], label="as it was called before")
     config = dataclasses.replace(config, methods=(old, *config.methods[1:]))
@@ -371,23 +291,13 @@ def test_a_design_is_found_in_whatever_table_it_was_trained(tmp_path):
     }
     assert paper.find(tmp_path, world, "unconstrained", scale) is not None
     assert paper.find(tmp_path, world, "limit_-1", scale) is None
-    assert paper.find(tmp_path, world, "steep", paper.scales()["reduced"]) is None
-
-
-def test_a_round_of_the_searches_counts_as_trained(tmp_path):
-    scale, world = paper.scales()["smoke"], "Goal-Hazard-Point"
-    config = paper.table(world, ["evolved"], scale)
-    with RunDir.create(tmp_path / "a_round", config) as run:
-        run.write_json("evaluation", {"episodes": 2, "rows": []})
-    found = paper.find(tmp_path, world, "evolved", scale)
-    assert found is not None
-    assert found.path == tmp_path / "a_round"
-    assert paper.find(tmp_path, "Goal-Pillar-Point", "evolved", scale) is None
+    assert paper.find(tmp_path, world, "steep", paper.scales(world)["reduced"]) is None
 
 
 def test_a_table_holds_networks_of_one_size():
     """Costs without a network go with the first."""
-    scale = paper.scales()["smoke"]._replace(evolved="ic4srl_nearest")
+    scale = paper.scales("Goal-Hazard8-Point")["smoke"]
+    scale = scale._replace(found={**scale.found, "evolved": "min_distance_8"})
     groups = paper.by_network(["evolved", "extrinsic", "steep", "margin_2x"], scale)
     assert groups == [["extrinsic", "margin_2x", "evolved"], ["steep"]]
     for group in groups:
@@ -450,11 +360,12 @@ def test_shapes_from_training_to_picture(tmp_path):
 
 
 def test_fresh_scores_stand_beside_the_shapes(tmp_path):
-    file = ROOT / "experiments" / "results" / "reduced_10m" / "margins.json"
-    found = dict(shapes.fresh_scores(file, "cpo"))
+    file = CROWDED / "reduced_10m" / "margins.json"
+    found = dict(shapes.fresh_scores(file, "Goal-Hazard8-Point", "cpo"))
     assert list(found) == list(shapes.MARKERS)
     assert found["margin_2x"]["episodes"] == 1000
-    assert shapes.fresh_scores(tmp_path / "none.json", "cpo") == []
+    assert shapes.fresh_scores(file, "Goal-Hazard-Point", "cpo") == []
+    assert shapes.fresh_scores(tmp_path / "none.json", "Goal-Hazard-Point", "cpo") == []
 
 
 def test_one_figure_from_training_to_picture(tmp_path):
@@ -470,6 +381,7 @@ def test_one_figure_from_training_to_picture(tmp_path):
     ]
     assert trained == ["limit_0.5+extrinsic"]  # side by side
     result = json.loads((tmp_path / "cost_limits.json").read_text())
+    assert result["world"] == "Goal-Hazard-Point"
     panel = result["worlds"]["Goal-Hazard-Point"]
     assert list(panel) == ["limit_0.5", "extrinsic"]
     for trained in panel.values():

@@ -13,7 +13,7 @@ from autocost_jax.store import RunDir
 from scripts import load_script
 
 ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "experiments" / "results" / "robots"
+RESULTS = ROOT / "experiments" / "results" / "eight_hazards" / "robots"
 
 
 @pytest.fixture(scope="module")

@@ -67,9 +67,11 @@ def test_the_table_of_the_worlds_is_that_of_the_configurations():
         assert config.num_steps == 1000
         assert not config.constrain_indicator
     assert table_row("extents") == "2 m"
+    crowded = env_config("Goal-Hazard8-Point")
+    assert push.hazards_num == goal.hazards_num
     assert table_row("hazards") == (
-        f"{goal.hazards_num} (Push: {push.hazards_num}), radius {goal.hazards_size} m, "
-        f"keepout {goal.hazards_keepout} m"
+        f"{goal.hazards_num} (`Goal-Hazard8-*`: {crowded.hazards_num}), "
+        f"radius {goal.hazards_size} m, keepout {goal.hazards_keepout} m"
     )
     assert table_row("pillars") == (
         f"{pillars.pillars_num}, radius {pillars.pillars_size} m, "
@@ -123,8 +125,10 @@ def test_the_wheel_would_hold_everything_that_is_read_at_run_time():
         ("benchmarks/population", "benchmarks/results/population_laptop"),
         ("benchmarks/population", "benchmarks/results/population_paper"),
         ("benchmarks/peers", "benchmarks/results/peers"),
-        ("experiments/main_job", "experiments/results/laptop/main_job"),
-        ("experiments/agreement", "experiments/results/agreement/agreement"),
+        (
+            "experiments/agreement",
+            "experiments/results/eight_hazards/agreement/agreement",
+        ),
     ],
 )
 def test_the_tables_are_those_of_the_committed_json(script, result):

@@ -30,7 +30,7 @@ class EnvConfig:
     """One Safety Gym world; lengths in metres, names as in Safety Gym's engine.
 
     The default is the paper's training environment, Goal-Hazard-Point. The paper does
-    not state counts, radii, extents and keepouts: these are engine defaults where Safety
+    not state counts, radii, extents and keepouts: they are engine defaults where Safety
     Gym has one, and 4 hazards as in the configurations that its authors' lab published
     before it (ISSA 2021, Safety Index Synthesis 2022). Later ones of that lab (GUARD)
     have 8, the crowded `Goal-Hazard8-*`. `env_config` has all the others.
