@@ -261,6 +261,18 @@ def test_policies_are_compared_one_by_one():
     assert result["violations"]["difference"]["mean"] == pytest.approx(0.0)
 
 
+@pytest.mark.parametrize(
+    ("world", "words"),
+    [("Goal-Hazard-Car", "Car 4"), ("Goal-Hazard8-Point", "Point 8")],
+)
+def test_safety_gymnasium_is_told_how_many_hazards_there_are(tmp_path, world, words):
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\nshift\necho "[\\"$*\\"]"\n')
+    python.chmod(0o755)
+    told = transfer.play(python, tmp_path / "policy.npz", world, 10, 3)
+    assert told == [f"{tmp_path}/policy.npz {words} 10 3"]
+
+
 def test_a_run_of_another_cost_is_not_taken_for_this_one(tmp_path):
     scale = paper.scales()["smoke"]
     old = paper.table("Goal-Hazard-Point", ["extrinsic"], scale)
