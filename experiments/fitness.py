@@ -32,7 +32,7 @@ from autocost_jax.commandline import use_devices
 from autocost_jax.config import EnvConfig, TrainConfig, preset
 from autocost_jax.costs import training_cost
 from autocost_jax.envs.env import Env, make_env
-from autocost_jax.es import graded_start
+from autocost_jax.starts import graded_start
 from autocost_jax.evaluate import evaluate
 from autocost_jax.population import Population, make_agents, make_population
 from autocost_jax.records import Slot
@@ -73,7 +73,8 @@ def costs(env: Env, size: Size) -> np.ndarray:
     """theta [C, 41] of all costs; the references' are unused zeros, in front."""
     key_graded, key_normal = jax.random.split(jax.random.key(2026))
     places = typical_lidars(env, jax.random.key(0))
-    graded = graded_start(key_graded, size.graded, 8.0, places)
+    ranges = {"quiet_places": (10.0, 75.0), "loud_costs": (0.01, 0.5)}
+    graded = graded_start(key_graded, size.graded, 8.0, places, **ranges)
     normal = 5.0 * jax.random.normal(key_normal, (size.normal, 41))
     none = jnp.zeros((len(REFERENCES), 41))
     return np.asarray(jnp.concatenate([none, graded, normal]))

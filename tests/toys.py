@@ -104,6 +104,7 @@ def make_toy_env(
                 "goals_met": jnp.zeros((), jnp.int32),
                 "goal_move_failures": jnp.zeros((), jnp.int32),
                 "distance_travelled": zero,
+                "steps_outside": jnp.zeros((), jnp.int32),
             },
             key=key,
         )
@@ -149,6 +150,8 @@ def make_toy_env(
                 "goal_move_failures": counters["goal_move_failures"],
                 "distance_travelled": counters["distance_travelled"]
                 + live(jnp.sqrt((move**2).sum())),
+                "steps_outside": counters["steps_outside"]
+                + (jnp.abs(layout.robot_xy) > ARENA).any(),
             },
         )
 

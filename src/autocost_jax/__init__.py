@@ -31,10 +31,9 @@ from autocost_jax.es import (
     ES,
     Fitness,
     best,
-    graded_start,
-    keep_level,
-    monotone_start,
     mutate,
+    pool,
+    rank,
     select,
     truncation_es,
 )
@@ -52,6 +51,7 @@ from autocost_jax.records import (
     Trajectory,
 )
 from autocost_jax.rollout import reset_worlds, unroll
+from autocost_jax.starts import graded_start
 from autocost_jax.train import run_stage, train
 
 __all__ = [
@@ -83,16 +83,16 @@ __all__ = [
     "evolve",
     "graded_start",
     "intrinsic_cost",
-    "keep_level",
     "list_costs",
     "list_envs",
     "load_cost",
     "make_env",
     "make_population",
-    "monotone_start",
     "mutate",
+    "pool",
     "ppo_lagrangian",
     "preset",
+    "rank",
     "reset_worlds",
     "run_stage",
     "save_cost",

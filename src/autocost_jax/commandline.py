@@ -69,7 +69,7 @@ def with_env(train: TrainConfig, argv: Sequence[str]) -> TrainConfig:
     """The training configuration in the world that `--env` names, if it is given.
 
     Flags of single settings come on top of it; only the episode's length is the
-    preset's.
+    preset's, and the physics where the world has them.
 
     Raises:
       ValueError: if there is no such world; the message lists those that exist.
@@ -78,6 +78,8 @@ def with_env(train: TrainConfig, argv: Sequence[str]) -> TrainConfig:
     if name is None:
         return train
     env = dataclasses.replace(env_config(name), num_steps=train.env.num_steps)
+    if env.has_closed_form:
+        env = dataclasses.replace(env, physics=train.env.physics)
     return dataclasses.replace(train, env=env)
 
 

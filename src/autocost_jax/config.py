@@ -6,8 +6,9 @@ AutoCost paper nor Safety Gym settles.
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from autocost_jax.checks import (
     is_finite,
@@ -21,8 +22,7 @@ from autocost_jax.env_config import EnvConfig
 
 Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
-Start = Literal["normal", "monotone", "graded"]
-Judge = Literal["mean", "worst"]
+Start = Literal["normal", "graded"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 CostNetwork = Literal["dense", "nearest"]
 THETA_SIZES: dict[CostNetwork, int] = {"dense": 41, "nearest": 13}
@@ -183,14 +183,16 @@ class SearchConfig:
     a mean extrinsic cost <= `zero_tolerance` over those episodes.
     `selection="random"` replaces the ranking by a random choice: the control.
 
-    Five options of ours beside the paper's rule. `start="monotone"` draws first costs
-    that rise as anything comes nearer and are small at a typical place, see
-    `es.monotone_start`; "graded" ones also have a set loudness, see
-    `es.graded_start`. With `keep_level` a mutation leaves the cost of a typical place
-    about as it is, see `es.keep_level`. With a `return_floor` a candidate of a lower
-    return ranks behind all others, however safe it is, see `es.rank`. A candidate is
-    judged by the mean over its algorithms, or with `judge_by="worst"` by their highest
-    cost and lowest return: under a mean one algorithm may flee while the other drives.
+    Options of ours beside the paper's rule, all off by default. `start="graded"` draws
+    first costs that rise as anything comes nearer, with a set reach and loudness, see
+    `starts.graded_start`. Each candidate is trained with `seeds_per_candidate` seeds and
+    judged by their mean. With `references` each algorithm trains two more slots a seed
+    in every stage, the extrinsic cost alone and with a margin of 3x; `return_share`
+    asks that a candidate returns that share of what the first of them does, and ranks
+    those that do not behind all others. With `pool_scores` elites are
+    judged by all stages that trained them. After the last stage the `num_finalists`
+    best are trained from scratch with `final_seeds` fresh seeds for `final_epochs`
+    epochs (0: as many as in a stage), the references beside them.
     With `network="nearest"` candidates are networks of 13 parameters that see only how
     near the closest object is, see `costs.intrinsic_logit`; "dense" is the paper's.
     """
@@ -210,14 +212,24 @@ class SearchConfig:
     zero_tolerance: float = 0.0
     selection: Selection = "paper"
     start: Start = "normal"
-    keep_level: bool = False
-    return_floor: float | None = None
-    judge_by: Judge = "mean"
     network: CostNetwork = "dense"
+    seeds_per_candidate: int = 1
+    references: bool = False
+    return_share: float = 0.0
+    pool_scores: bool = False
+    num_finalists: int = 0
+    final_seeds: int = 3
+    final_epochs: int = 0
 
     def __post_init__(self) -> None:
         require_counts(
-            self, "population_size", "num_elites", "num_stages", "fitness_epochs"
+            self,
+            "population_size",
+            "num_elites",
+            "num_stages",
+            "fitness_epochs",
+            "seeds_per_candidate",
+            "final_seeds",
         )
         size = self.population_size
         require(
@@ -253,18 +265,60 @@ class SearchConfig:
         literals = {
             "selection": Selection,
             "start": Start,
-            "judge_by": Judge,
             "network": CostNetwork,
         }
         for name, kind in literals.items():
             value, known = getattr(self, name), get_args(kind)
             require(value in known, name, f"one of {', '.join(known)}", value)
-        flag = self.keep_level
-        require(isinstance(flag, bool), "keep_level", "true or false", flag)
-        floor = self.return_floor
-        require(floor is None or is_finite(floor), "return_floor", "finite", floor)
+        for name in ("references", "pool_scores"):
+            flag = getattr(self, name)
+            require(isinstance(flag, bool), name, "true or false", flag)
+        share = self.return_share
+        highest = math.inf if self.references else 0.0
+        allowed = "finite and >= 0, and 0 without references"
+        ok = is_finite(share) and 0 <= share <= highest
+        require(ok, "return_share", allowed, share)
+        self._check_finalists()
         ok = is_integer(self.seed) and 0 <= self.seed < 2**32
         require(ok, "seed", "an integer in [0, 2**32)", self.seed)
+
+    def _check_finalists(self) -> None:
+        count, size = self.num_finalists, self.population_size
+        ok = is_integer(count) and 0 <= count <= size
+        require(ok, "num_finalists", f"in [0, population_size={size}]", count)
+        chunk, epochs = self.train.chunk_epochs, self.final_epochs
+        require(
+            is_integer(epochs) and epochs >= 0 and epochs % chunk == 0,
+            "final_epochs",
+            f"a multiple of chunk_epochs={chunk}, or 0",
+            epochs,
+        )
+
+    @property
+    def num_references(self) -> int:
+        """Reference costs that each algorithm trains beside the candidates, R."""
+        return 2 if self.references else 0
+
+    @property
+    def slots_per_algorithm(self) -> int:
+        """Slots of each algorithm in the program, those of a stage or of the finalists.
+
+        Where one has fewer, copies of its first slot fill it up.
+        """
+        costs = self.population_size + self.num_references
+        finalists = self.num_finalists + self.num_references
+        final = finalists * self.final_seeds if self.num_finalists else 0
+        return max(costs * self.seeds_per_candidate, final)
+
+    def epochs_of(self, stage: int) -> int:
+        """Epochs of a stage; `num_stages` is that of the finalists."""
+        is_final = stage >= self.num_stages
+        return (is_final and self.final_epochs) or self.train.num_epochs
+
+    @property
+    def total_stages(self) -> int:
+        """Stages of training, the finalists' included."""
+        return self.num_stages + (self.num_finalists > 0)
 
     @property
     def theta_size(self) -> int:
@@ -284,10 +338,14 @@ class SearchConfig:
     @property
     def env_steps(self) -> int:
         """Environment steps of the whole search's training."""
-        train = self.train
-        slots = self.population_size * len(self.algorithms)
-        epoch = train.num_worlds * train.env.num_steps
-        return self.num_stages * train.num_epochs * slots * epoch
+        epochs = sum(self.epochs_of(stage) for stage in range(self.total_stages))
+        return epochs * self.epoch_env_steps
+
+    @property
+    def epoch_env_steps(self) -> int:
+        """Environment steps of an epoch of all slots."""
+        slots = self.slots_per_algorithm * len(self.algorithms)
+        return slots * self.train.num_worlds * self.train.env.num_steps
 
 
 _LAPTOP_AGENT = AgentConfig(
@@ -299,23 +357,51 @@ _LAPTOP_AGENT = AgentConfig(
     value_minibatches=8,
 )
 
+# What `experiments/fitness.py` and `learners.py` support: a start among costs of which
+# some are useful, mild mutations, long stages rather than more seeds, a price in return.
+_GUIDED: dict[str, Any] = {
+    "start": "graded",
+    "init_std": 8.0,
+    "mutation_std": 0.3,
+    "mutation_low": 0.8,
+    "mutation_high": 1.25,
+    "references": True,
+    "return_share": 0.3,
+    "pool_scores": True,
+}
+
 PRESETS: dict[str, SearchConfig] = {
     "laptop": SearchConfig(
         train=TrainConfig(
-            agent=_LAPTOP_AGENT, num_worlds=4, num_epochs=27, chunk_epochs=1
+            env=EnvConfig(physics="closed_form"),
+            agent=_LAPTOP_AGENT,
+            num_worlds=4,
+            num_epochs=80,
+            chunk_epochs=2,
         ),
-        population_size=8,
+        population_size=10,
         num_elites=2,
-        num_stages=3,
-        fitness_epochs=3,
-        init_std=5.0,
+        num_stages=2,
+        fitness_epochs=20,
+        num_finalists=2,
+        final_epochs=104,
+        **_GUIDED,
     ),
     "search": SearchConfig(
         train=TrainConfig(
-            agent=_LAPTOP_AGENT, num_worlds=30, num_epochs=33, chunk_epochs=3
+            env=EnvConfig(physics="closed_form"),
+            agent=_LAPTOP_AGENT,
+            num_worlds=4,
+            num_epochs=128,
+            chunk_epochs=4,
         ),
-        num_stages=5,
-        init_std=5.0,
+        num_stages=4,
+        fitness_epochs=32,
+        seeds_per_candidate=3,
+        num_finalists=10,
+        final_seeds=5,
+        final_epochs=512,
+        **_GUIDED,
     ),
     "paper": SearchConfig(train=TrainConfig(chunk_epochs=3)),
     "smoke": SearchConfig(
@@ -336,7 +422,9 @@ PRESETS: dict[str, SearchConfig] = {
         num_elites=1,
         num_stages=2,
         fitness_epochs=1,
-        init_std=5.0,
+        num_finalists=1,
+        final_seeds=2,
+        **_GUIDED,
     ),
 }
 

@@ -94,9 +94,8 @@ class EnvConfig:
             value, allowed = getattr(self, name), get_args(kind)
             require(value in allowed, name, f"one of {', '.join(allowed)}", value)
         require_counts(self, "num_steps", "frameskip_binom_n", "lidar_num_bins")
-        is_free = self.task == "Goal" and not (self.pillars_num or self.vases_num)
         require(
-            self.physics != "closed_form" or (self.robot == "Point" and is_free),
+            self.physics != "closed_form" or self.has_closed_form,
             "physics",
             "reduced or full where the robot is no Point or can touch something",
             self.physics,
@@ -128,6 +127,12 @@ class EnvConfig:
             f"(xmin, ymin, xmax, ymax), finite, more than {wide} m wide and high",
             corners,
         )
+
+    @property
+    def has_closed_form(self) -> bool:
+        """Whether the robot is a Point that nothing can touch."""
+        is_free = self.task == "Goal" and not (self.pillars_num or self.vases_num)
+        return self.robot == "Point" and is_free
 
     @property
     def constrained(self) -> tuple[str, ...]:

@@ -16,26 +16,23 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from autocost_jax.config import THETA_SIZES, CostNetwork, SearchConfig
-from autocost_jax.costs import HIDDEN, intrinsic_logit
+from autocost_jax.config import SearchConfig
 from autocost_jax.records import Key
-
-QUIET_COST = 1e-4  # of a `monotone_start` at a typical place, or a `graded_start`
-QUIET_PLACES = (10.0, 75.0)  # percentiles; where a `graded_start` is quiet
-LOUD_PLACE = 85.0  # percentile at which its loudness is set
-LOUD_COSTS = (0.01, 0.5)  # how loud it is there
 
 
 class Fitness(struct.PyTreeNode):
     """How good the candidates were; lower cost first, then higher return.
 
     Attributes:
-      cost: [P] mean extrinsic cost of an episode; +inf for a broken candidate.
-      ep_return: [P] mean return of an episode; -inf for a broken candidate.
+      cost: [P] mean extrinsic cost per episode; +inf for a broken candidate.
+      ep_return: [P] return per episode; -inf for a broken candidate.
+      floor: [P] return below which a candidate is of no use; None: there is no such
+        demand. See `rank`.
     """
 
     cost: jax.Array
     ep_return: jax.Array
+    floor: jax.Array | None = None
 
     @property
     def finite(self) -> jax.Array:
@@ -98,27 +95,25 @@ class ES(NamedTuple):
     tell: Callable[[Key, ESState, Any, Fitness], ESState]
 
 
-def rank(
-    fitness: Fitness, zero_tolerance: float = 0.0, return_floor: float | None = None
-) -> jax.Array:
+def rank(fitness: Fitness, zero_tolerance: float = 0.0) -> jax.Array:
     """Indices [P], best first: cost (<= tolerance counts as 0), then return.
 
     One lexicographic sort covers both branches of the paper's rule: with more
     zero-violation candidates than elites the highest returns win, otherwise the lowest
     costs. Anything non-finite comes last.
 
-    The option `return_floor` is not the paper's: candidates of a lower return come
+    Where the fitness has floors (ours), candidates that return less than theirs come
     after all others and are compared by return alone (the feasibility rule of Deb 2000,
-    "An efficient constraint handling method for genetic algorithms"). Without it costs
+    "An efficient constraint handling method for genetic algorithms"). Without them costs
     that make agents flee or stand still win, as they are the first to be safe.
     """
     ok = fitness.finite
     cost = jnp.where(fitness.cost <= zero_tolerance, 0.0, fitness.cost)
     cost = jnp.where(ok, cost, jnp.inf)
     loss = jnp.where(ok, -fitness.ep_return, jnp.inf)
-    if return_floor is None:
+    if fitness.floor is None:
         return jnp.lexsort((loss, cost))
-    is_low = ok & (fitness.ep_return < return_floor)
+    is_low = ok & (fitness.ep_return < fitness.floor)
     cost = jnp.where(is_low, 0.0, cost)
     return jnp.lexsort((loss, cost, is_low, ~ok))
 
@@ -128,7 +123,6 @@ def select(
     fitness: Fitness,
     num_elites: int,
     zero_tolerance: float = 0.0,
-    return_floor: float | None = None,
 ) -> tuple[Any, jax.Array]:
     """The best candidates and their indices, in rank order.
 
@@ -137,7 +131,6 @@ def select(
       fitness: fields [P].
       num_elites: E.
       zero_tolerance: cost up to which a candidate counts as free of violations.
-      return_floor: see `rank`.
 
     Returns:
       Elites, stacked [E, ...], and their indices [E].
@@ -148,7 +141,7 @@ def select(
     size = fitness.cost.shape[0]
     if not 1 <= num_elites <= size:
         raise ValueError(f"num_elites must be in [1, {size}], got {num_elites}")
-    index = rank(fitness, zero_tolerance, return_floor)[:num_elites]
+    index = rank(fitness, zero_tolerance)[:num_elites]
     return jax.tree.map(lambda x: x[index], candidates), index
 
 
@@ -190,145 +183,6 @@ def mutate(
     return treedef.unflatten(children)
 
 
-def monotone_start(
-    key: Key,
-    num: int,
-    std: float,
-    lidars: jax.Array,
-    network: CostNetwork = "dense",
-) -> jax.Array:
-    """Random costs that never fall as anything comes nearer; not the paper's start.
-
-    Weights are |N(0, std^2)|, hidden units turn on around the mean lidar (their biases
-    are N(0, std^2) from there), and the output bias makes the median cost over `lidars`
-    1e-4: with a limit of 0 CPO ignores the reward as long as what a cost asks for
-    everywhere adds up to more than it can take back in one step.
-
-    Args:
-      key: consumed.
-      num: P.
-      std: scale of the parameters.
-      lidars: [M, 8] readings at typical places.
-      network: which network the parameters are of.
-
-    Returns:
-      theta [P, D].
-    """
-    inner, bias, outer = _random_parts(key, num, std, network)
-    typical = _readings(lidars, network).mean(0)
-    bias = bias - jnp.einsum("b,pbh->ph", typical, inner)
-    theta = _join_parts(inner, bias, outer, jnp.zeros(num))
-    quiet = _logit(QUIET_COST) - jnp.median(_logits(theta, lidars), axis=1)
-    return theta.at[:, -1].set(quiet)
-
-
-def graded_start(
-    key: Key,
-    num: int,
-    std: float,
-    lidars: jax.Array,
-    network: CostNetwork = "dense",
-) -> jax.Array:
-    """Random monotone costs of a set loudness; not the paper's start.
-
-    As `monotone_start`, but each hidden unit turns on where one of the typical places
-    has its readings, and the output layer is scaled so that over all of them the cost
-    is 1e-4 at a percentile uniform in [10, 75] and log-uniform in [0.01, 0.5] at the
-    85th: most of a `monotone_start` is silent everywhere or so loud that agents flee,
-    whatever its shape.
-
-    Args:
-      key: consumed.
-      num: P.
-      std: scale of the parameters, before the output layer is scaled.
-      lidars: [M, 8] readings at typical places.
-      network: which network the parameters are of.
-
-    Returns:
-      theta [P, D].
-    """
-    key_parts, key_place, key_quiet, key_level = jax.random.split(key, 4)
-    inner, _, outer = _random_parts(key_parts, num, std, network)
-    index = jax.random.randint(key_place, (num, HIDDEN), 0, lidars.shape[0])
-    places = _readings(lidars, network)[index]
-    bias = -jnp.einsum("phb,pbh->ph", places, inner)
-    logits = _logits(_join_parts(inner, bias, outer, jnp.zeros(num)), lidars)
-    quiet = jax.random.uniform(
-        key_quiet, (num,), minval=QUIET_PLACES[0], maxval=QUIET_PLACES[1]
-    )
-    low = jax.vmap(jnp.percentile)(logits, quiet)
-    high = jnp.percentile(logits, LOUD_PLACE, axis=1)
-    low_level, high_level = (jnp.log(cost) for cost in LOUD_COSTS)
-    level = jax.random.uniform(key_level, (num,), minval=low_level, maxval=high_level)
-    contrast = jnp.maximum(high - low, 0.01 * outer.sum(1))  # units may be all but off
-    scale = (_logit(jnp.exp(level)) - _logit(QUIET_COST)) / contrast
-    last = _logit(QUIET_COST) - scale * low
-    return _join_parts(inner, bias, scale[:, None] * outer, last)
-
-
-def _random_parts(
-    key: Key, num: int, std: float, network: CostNetwork
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """|W1| [P, rows, 4], b1 [P, 4] and |W2| [P, 4] of N(0, std^2)."""
-    theta = std * jax.random.normal(key, (num, THETA_SIZES[network]), jnp.float32)
-    split = theta.shape[1] - 1 - 2 * HIDDEN
-    inner, bias, outer = jnp.split(theta[:, :-1], (split, split + HIDDEN), axis=1)
-    return jnp.abs(inner).reshape(num, -1, HIDDEN), bias, jnp.abs(outer)
-
-
-def _join_parts(
-    inner: jax.Array, bias: jax.Array, outer: jax.Array, last: jax.Array
-) -> jax.Array:
-    """Theta [P, D] of its parts, the last one [P]."""
-    parts = (inner.reshape(len(inner), -1), bias, outer, last[:, None])
-    return jnp.concatenate(parts, axis=1)
-
-
-def _readings(lidars: jax.Array, network: CostNetwork) -> jax.Array:
-    """What the rows of W1 are multiplied with, [M, rows]."""
-    return lidars if network == "dense" else lidars.max(1, keepdims=True)
-
-
-def _logits(theta: jax.Array, lidars: jax.Array) -> jax.Array:
-    """[P, M] of theta [P, D] and lidars [M, 8]."""
-    return jax.vmap(lambda theta: intrinsic_logit(theta, lidars))(theta)
-
-
-def _logit(cost: jax.Array | float) -> jax.Array:
-    return jnp.log(cost / (1 - jnp.asarray(cost)))
-
-
-def keep_level(
-    key: Key, elites: jax.Array, children: jax.Array, lidars: jax.Array, std: float
-) -> jax.Array:
-    """Children that are about as loud at a typical place as their parents were.
-
-    A mutation of the weights shifts the cost of every place by orders of magnitude, so
-    that a child of a good cost is mostly silent or shouts everywhere. Here the output
-    bias takes that back: a child's median odds over `lidars` are its parent's, times
-    exp(N(0, std^2)). Ours, not the paper's.
-
-    Args:
-      key: consumed.
-      elites: theta [E, D].
-      children: theta [C, D], dealt round-robin as by `mutate`.
-      lidars: [M, 8] readings at typical places.
-      std: deviation of the logarithm.
-
-    Returns:
-      theta [C, D].
-    """
-
-    def level(theta: jax.Array) -> jax.Array:
-        return jnp.median(intrinsic_logit(theta, lidars))
-
-    size = children.shape[0]
-    parents = elites[jnp.arange(size) % elites.shape[0]]
-    noise = std * jax.random.normal(key, (size,), children.dtype)
-    shift = jax.vmap(level)(parents) - jax.vmap(level)(children) + noise
-    return children.at[:, -1].add(shift)
-
-
 def pool(candidates: Any, fitness: Fitness) -> Fitness:
     """For each row the mean fitness of all rows that hold the same candidate.
 
@@ -339,16 +193,23 @@ def pool(candidates: Any, fitness: Fitness) -> Fitness:
       candidates: stacked pytree [N, ...].
       fitness: fields [N].
     """
-    same = jnp.ones((fitness.cost.shape[0],) * 2, bool)
-    for leaf in jax.tree.leaves(candidates):
-        equal = leaf[:, None] == leaf[None]
-        same &= equal.reshape(*same.shape, -1).all(-1)
+    same = _same(candidates)
 
     def mean(values: jax.Array) -> jax.Array:
         rows = jnp.where(same, values[None], 0.0)  # 0 x inf would be NaN
         return jnp.sum(rows, 1) / jnp.sum(same, 1)
 
     return jax.tree.map(mean, fitness)
+
+
+def _same(candidates: Any) -> jax.Array:
+    """[N, N] bool, which rows hold the same candidate."""
+    leaves = jax.tree.leaves(candidates)
+    same = jnp.ones((leaves[0].shape[0],) * 2, bool)
+    for leaf in leaves:
+        equal = leaf[:, None] == leaf[None]
+        same &= equal.reshape(*same.shape, -1).all(-1)
+    return same
 
 
 def _normal_start(config: SearchConfig, key: Key) -> jax.Array:
@@ -406,6 +267,7 @@ def truncation_es(
             archive_fitness=Fitness(
                 cost=jnp.full(capacity, jnp.inf, jnp.float32),
                 ep_return=jnp.full(capacity, -jnp.inf, jnp.float32),
+                floor=jnp.full(capacity, -jnp.inf, jnp.float32),
             ),
         )
 
@@ -420,6 +282,8 @@ def truncation_es(
         )
 
     def tell(key: Key, state: ESState, candidates: Any, fitness: Fitness) -> ESState:
+        if fitness.floor is None:
+            fitness = fitness.replace(floor=jnp.full_like(fitness.cost, -jnp.inf))
         place = state.generation * size
 
         def put(old: jax.Array, new: jax.Array) -> jax.Array:
@@ -459,20 +323,45 @@ def failed_stage(state: ESState, population_size: int) -> jax.Array:
     return jnp.where(jnp.any(failed), jnp.argmax(failed), -1).astype(jnp.int32)
 
 
+def top(
+    state: ESState, num: int, zero_tolerance: float = 0.0, pool_scores: bool = False
+) -> tuple[Fitness, jax.Array]:
+    """The best distinct candidates of all stages.
+
+    Args:
+      state: of the strategy.
+      num: M.
+      zero_tolerance: see `rank`.
+      pool_scores: judge each by all stages that trained it, see `pool`.
+
+    Returns:
+      The fitness that the archive's candidates are judged by, and the places [M] of
+      the best in the archive; broken candidates come when no others are left.
+    """
+    fitness = state.archive_fitness
+    if not pool_scores:
+        return fitness, rank(fitness, zero_tolerance)[:num]
+    fitness = pool(state.archive, fitness)
+    same = _same(state.archive)
+    again = jnp.any(jnp.tril(same, -1), axis=1)  # an earlier row holds it, too
+    worst = jnp.where(again, jnp.inf, fitness.cost)
+    return fitness, rank(fitness.replace(cost=worst), zero_tolerance)[:num]
+
+
 def best(
     state: ESState,
     population_size: int,
     zero_tolerance: float = 0.0,
-    return_floor: float | None = None,
+    pool_scores: bool = False,
 ) -> Best:
     """The final pick: of all zero-violation candidates the one of highest return.
 
-    Without any, that of lowest cost; `zero_violation` says which it is. With a
-    `return_floor` either of those that reach it; if none does, the highest return.
-    Of a failed search there is no pick, see `Best`.
+    Without any, that of lowest cost; `zero_violation` says which it is. Where the
+    fitness has floors either of those that reach them; if none does, the highest
+    return. Of a failed search there is no pick, see `Best`.
     """
-    fitness = state.archive_fitness
-    index = rank(fitness, zero_tolerance, return_floor)[0]
+    fitness, order = top(state, 1, zero_tolerance, pool_scores)
+    index = order[0]
     is_failed = failed_stage(state, population_size) >= 0
     found = fitness.finite[index] & ~is_failed
 

@@ -23,6 +23,7 @@ class Episodes(struct.PyTreeNode):
       valid: [T, E] 1.0 until the world fails.
       watched: what `watch` kept, of the start and of every step, leaves [T + 1, ...].
       distance_travelled: [E] path length, metres.
+      steps_outside: [E] steps outside the arena.
     """
 
     start: Layout
@@ -31,6 +32,7 @@ class Episodes(struct.PyTreeNode):
     valid: jax.Array
     watched: Any
     distance_travelled: jax.Array
+    steps_outside: jax.Array
 
 
 def _nothing(worlds: EnvState) -> tuple[()]:
@@ -83,6 +85,7 @@ def run_episodes(
             watched,
         ),
         distance_travelled=worlds.metrics["distance_travelled"].astype(jnp.float32),
+        steps_outside=worlds.metrics["steps_outside"].astype(jnp.float32),
     )
 
 
@@ -96,6 +99,7 @@ def score(episodes: Episodes) -> EvalResult:
         ep_return=jnp.sum(valid * episodes.reward, axis=0),
         ep_cost=ep_cost,
         distance_travelled=episodes.distance_travelled,
+        outside_share=episodes.steps_outside / valid.shape[0],
         valid=whole,
         # A count of episodes: the floor only keeps 0 / 0 away.
         violation_rate=violations / jnp.maximum(jnp.sum(whole), 1.0),

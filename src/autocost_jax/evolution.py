@@ -5,6 +5,7 @@ can be watched, checkpointed and resumed, and `search`, a pure function of a key
 are made of the same pieces.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -14,36 +15,25 @@ import numpy as np
 from flax import struct
 
 from autocost_jax import es as es_lib
-from autocost_jax.config import SearchConfig, Start
-from autocost_jax.costs import BANK, CostTerm, training_cost
+from autocost_jax.config import SearchConfig
+from autocost_jax.costs import BANK, CostTerm
 from autocost_jax.envs.env import make_env
-from autocost_jax.es import ES, ESState, Fitness, truncation_es
+from autocost_jax.es import ESState, Fitness
 from autocost_jax.population import (
     Population,
-    candidate_slots,
     jit_bundle,
     make_agents,
     make_population,
 )
 from autocost_jax.records import Key, Metrics, Slot
-from autocost_jax.rollout import typical_lidars
-from autocost_jax.train import Learner, final_episodes, init_learner, run_stage
-
-# What the fitness and the report are made of, kept for every epoch of a stage.
-TRACKED = (
-    "ep_cost",
-    "ep_return",
-    "distance_travelled",
-    "intrinsic_far",
-    "intrinsic_near",
+from autocost_jax.stages import (
+    TRACKED,
+    StageFunctions,
+    StageResult,
+    deal,
+    stage_functions,
 )
-# How the first candidates are drawn, if not from N(0, init_std^2).
-STARTS: dict[Start, Callable[..., jax.Array]] = {
-    "monotone": es_lib.monotone_start,
-    "graded": es_lib.graded_start,
-}
-# Purposes of a stage's keys: every key is fold_in(root, stage, purpose).
-ASK, TELL, SLOTS = range(3)
+from autocost_jax.train import Learner, final_episodes, init_learner, run_stage
 
 
 class SearchState(struct.PyTreeNode):
@@ -51,11 +41,13 @@ class SearchState(struct.PyTreeNode):
 
     Attributes:
       es: the evolutionary strategy's state.
-      candidates: [P, D] the candidates in training.
-      learners: for each algorithm, stacked [P, ...].
-      stage: [] int32; `num_stages` once the search is over.
+      candidates: [P, D] the candidates in training; in the finalists' stage the best of
+        the search, of which the first are trained.
+      learners: for each algorithm, stacked [N, ...], slots as `stages.deal` has them.
+      stage: [] int32; `num_stages` is that of the finalists, and
+        `SearchConfig.total_stages` says that the search is over.
       epoch: [] int32, epochs of this stage already done.
-      history: `TRACKED` metrics of this stage, each [num_epochs, A, P].
+      history: `TRACKED` metrics of this stage, each [E, A, N], of E epochs at most.
     """
 
     es: ESState
@@ -66,33 +58,16 @@ class SearchState(struct.PyTreeNode):
     history: Metrics
 
 
-class StageResult(struct.PyTreeNode):
-    """What a finished stage leaves.
-
-    Attributes:
-      candidates: [P, D].
-      fitness: the pair (cost, return), fields [P].
-      scores: `TRACKED` metrics averaged over the fitness epochs, each [A, P].
-      order: [P] candidate indices, best first, by the paper's rule.
-      frozen: [A, P] bool, agents that met a non-finite number.
-    """
-
-    candidates: jax.Array
-    fitness: Fitness
-    scores: Metrics
-    order: jax.Array
-    frozen: jax.Array
-
-
 class Progress(NamedTuple):
     """What one chunk of `evolve` reports.
 
     Attributes:
       stage: stage of these epochs.
       epoch: first epoch of the chunk.
-      metrics: for each algorithm, NumPy arrays [K, P].
-      result: the stage's result if this chunk ended it, else None.
-      learners: with a result the trained agents, for each algorithm stacked [P, ...].
+      metrics: for each algorithm, NumPy arrays [K, N].
+      result: the stage's result if this chunk ended it, else None; the finalists' stage
+        has none, its agents are to be judged by fresh episodes.
+      learners: with a result the trained agents, for each algorithm stacked [N, ...].
     """
 
     stage: int
@@ -110,29 +85,18 @@ class SearchResult(struct.PyTreeNode):
         raises if all candidates of a stage failed. (`es.best` is then NaN.)
       fitness: fields [S, P], S stages.
       scores: `TRACKED` metrics of each stage, each [S, A, P].
+      references: the same of the reference costs, each [S, A, R].
+      finalists: [F, D], best first.
+      final_scores: `TRACKED` metrics of the finalists, then the references, over the
+        last `fitness_epochs` of their stage, each [A, F + R, seeds].
     """
 
     es: ESState
     fitness: Fitness
     scores: Metrics
-
-
-class StageFunctions(NamedTuple):
-    """What happens around the chunks of a stage, as pure functions.
-
-    Attributes:
-      init: () -> the state of the evolutionary strategy before the first stage.
-      begin: (es state, stage) -> candidates and, for each algorithm, slots.
-      slots: (stage, candidates) -> slots.
-      record: (history, metrics, epoch) -> history with the chunk's metrics.
-      end: (es state, stage, candidates, history, frozen) -> es state and result.
-    """
-
-    init: Callable[[], ESState]
-    begin: Callable[..., tuple[jax.Array, tuple[Slot, ...]]]
-    slots: Callable[..., tuple[Slot, ...]]
-    record: Callable[..., Metrics]
-    end: Callable[..., tuple[ESState, StageResult]]
+    references: Metrics
+    finalists: jax.Array
+    final_scores: Metrics
 
 
 class Searcher(NamedTuple):
@@ -151,128 +115,6 @@ class Searcher(NamedTuple):
     stage: StageFunctions
 
 
-def stage_key(root: Key, stage: jax.Array | int, purpose: int) -> Key:
-    """The key of one stage for one purpose."""
-    return jax.random.fold_in(jax.random.fold_in(root, stage), purpose)
-
-
-def stage_slots(
-    config: SearchConfig,
-    root: Key,
-    stage: jax.Array | int,
-    candidates: jax.Array,
-    bank: Sequence[CostTerm] = BANK,
-) -> tuple[Slot, ...]:
-    """For each algorithm the slots [P] that train c_ex + c_in of each candidate."""
-    cost = training_cost("extrinsic+intrinsic", candidates[0], config.cost_limit, bank)
-    size = candidates.shape[0]
-    stacked = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), cost)
-    stacked = stacked.replace(theta=candidates)
-    key = stage_key(root, stage, SLOTS)
-    return tuple(
-        candidate_slots(stacked, jax.random.fold_in(key, index))
-        for index in range(len(config.algorithms))
-    )
-
-
-def stage_result(
-    config: SearchConfig,
-    candidates: jax.Array,
-    history: Metrics,
-    frozen: jax.Array,
-) -> StageResult:
-    """Fitness and scores of a finished stage; a frozen agent costs +inf.
-
-    Args:
-      config: the search.
-      candidates: [P, D].
-      history: `TRACKED` metrics [num_epochs, A, P]; with cohorts those of whole
-        episodes of the final policies, [rounds, A, P].
-      frozen: [A, P] bool.
-    """
-    # A state that was not visited in an epoch has no intrinsic cost there: NaN.
-    last = {
-        name: (jnp.nanmean if name.startswith("intrinsic") else jnp.mean)(
-            value[-config.fitness_epochs :], axis=0
-        )
-        for name, value in history.items()
-    }
-    broken = jnp.any(frozen, axis=0)
-    is_mean = config.judge_by == "mean"
-    cost = (jnp.mean if is_mean else jnp.max)(last["ep_cost"], axis=0)
-    ep_return = (jnp.mean if is_mean else jnp.min)(last["ep_return"], axis=0)
-    fitness = Fitness(
-        cost=jnp.where(broken, jnp.inf, cost),
-        ep_return=jnp.where(broken, -jnp.inf, ep_return),
-    )
-    return StageResult(
-        candidates=candidates,
-        fitness=fitness,
-        scores=last,
-        order=es_lib.rank(fitness, config.zero_tolerance, config.return_floor),
-        frozen=frozen,
-    )
-
-
-def stage_functions(
-    config: SearchConfig, root: Key, bank: Sequence[CostTerm] = BANK
-) -> StageFunctions:
-    """The functions around the chunks of a search."""
-    strategy = _strategy(config)
-
-    def begin(state: ESState, stage: jax.Array | int):
-        candidates = strategy.ask(stage_key(root, stage, ASK), state)
-        return candidates, slots(stage, candidates)
-
-    def slots(stage: jax.Array | int, candidates: jax.Array) -> tuple[Slot, ...]:
-        return stage_slots(config, root, stage, candidates, bank)
-
-    def record(history: Metrics, metrics: tuple[Metrics, ...], epoch: jax.Array | int):
-        return {
-            name: jax.lax.dynamic_update_slice_in_dim(
-                value, jnp.stack([group[name] for group in metrics], 1), epoch, 0
-            )
-            for name, value in history.items()
-        }
-
-    def end(
-        state: ESState,
-        stage: jax.Array | int,
-        candidates: jax.Array,
-        history: Metrics,
-        frozen: jax.Array,
-    ):
-        result = stage_result(config, candidates, history, frozen)
-        key = stage_key(root, stage, TELL)
-        return strategy.tell(key, state, candidates, result.fitness), result
-
-    return StageFunctions(strategy.init, begin, slots, record, end)
-
-
-def _strategy(config: SearchConfig) -> ES:
-    """The strategy with the options that look at the world's typical places."""
-    if config.start == "normal" and not config.keep_level:
-        return truncation_es(config)
-    env = make_env(config.train.env)
-
-    def lidars() -> jax.Array:
-        return typical_lidars(env, jax.random.key(0))
-
-    def start(key: Key) -> jax.Array:
-        size, std = config.population_size, config.init_std
-        return STARTS[config.start](key, size, std, lidars(), config.network)
-
-    def adjust(key: Key, elites: jax.Array, children: jax.Array) -> jax.Array:
-        std = config.mutation_std
-        return es_lib.keep_level(key, elites, children, lidars(), std)
-
-    return truncation_es(
-        config,
-        start if config.start in STARTS else None,
-        adjust if config.keep_level else None,
-    )
-
-
 def search(
     config: SearchConfig, bank: Sequence[CostTerm] = BANK
 ) -> Callable[[Key], SearchResult]:
@@ -283,27 +125,38 @@ def search(
     def run(root: Key) -> SearchResult:
         functions = stage_functions(config, root, bank)
 
-        def body(state: ESState, stage: jax.Array):
-            candidates, slots = functions.begin(state, stage)
+        def train(slots: tuple[Slot, ...], epochs: int) -> tuple[Metrics, jax.Array]:
+            """`TRACKED` metrics [E, A, N], and which agents are frozen [A, N]."""
+            sizes = dataclasses.replace(config.train, num_epochs=epochs)
             learners = tuple(
                 jax.vmap(lambda slot, agent=agent: init_learner(agent, slot))(group)
                 for agent, group in zip(agents, slots, strict=True)
             )
-            learners, metrics = run_stage(
-                env, agents, config.train, learners, slots, bank
-            )
+            learners, metrics = run_stage(env, agents, sizes, learners, slots, bank)
             if config.final_rounds:
                 metrics = final_episodes(
-                    env, agents, config.train, learners, slots, config.final_rounds
+                    env, agents, sizes, learners, slots, config.final_rounds
                 )
-            history = _tracked(metrics)
-            frozen = jnp.stack([group.frozen for group in learners])
+            return _tracked(metrics), jnp.stack([group.frozen for group in learners])
+
+        def body(state: ESState, stage: jax.Array):
+            candidates, slots = functions.begin(state, stage)
+            history, frozen = train(slots, config.train.num_epochs)
             state, result = functions.end(state, stage, candidates, history, frozen)
-            return state, (result.fitness, result.scores)
+            return state, (result.fitness, result.scores, result.references)
 
         stages = jnp.arange(config.num_stages)
-        state, (fitness, scores) = jax.lax.scan(body, functions.init(), stages)
-        return SearchResult(es=state, fitness=fitness, scores=scores)
+        state, told = jax.lax.scan(body, functions.init(), stages)
+        candidates, slots = functions.begin_final(state)
+        final_scores: Metrics = {}
+        if config.num_finalists:
+            history, _ = train(slots, config.epochs_of(config.num_stages))
+            dealt = deal(config, is_final=True)
+            for name, value in history.items():
+                last = dealt.table(value[-config.fitness_epochs :])
+                final_scores[name] = jnp.mean(last, axis=0)
+        finalists = candidates[: config.num_finalists]
+        return SearchResult(state, *told, finalists, final_scores)
 
     return run
 
@@ -356,7 +209,7 @@ def evolve(
     searcher = make_searcher(config) if searcher is None else searcher
     state = init_search(searcher) if state is None else state
     require_survivors(config, state.es)
-    while int(state.stage) < config.num_stages:
+    while int(state.stage) < config.total_stages:
         state, progress = _run_chunk(searcher, state)
         yield state, progress
         if progress.result is not None:
@@ -365,8 +218,12 @@ def evolve(
 
 def _begin_stage(searcher: Searcher, es_state: ESState, stage: int) -> SearchState:
     config = searcher.config
-    candidates, slots = searcher.stage.begin(es_state, stage)
-    shape = (config.train.num_epochs, len(config.algorithms), config.population_size)
+    if stage < config.num_stages:
+        candidates, slots = searcher.stage.begin(es_state, stage)
+    else:
+        candidates, slots = searcher.stage.begin_final(es_state)
+    epochs = max(config.epochs_of(stage) for stage in range(config.total_stages))
+    shape = (epochs, len(config.algorithms), config.slots_per_algorithm)
     return SearchState(
         es=es_state,
         candidates=candidates,
@@ -381,7 +238,7 @@ def _run_chunk(searcher: Searcher, state: SearchState) -> tuple[SearchState, Pro
     """One chunk; at a stage's end also `tell` and the beginning of the next stage."""
     config, functions = searcher.config, searcher.stage
     stage, epoch = int(state.stage), int(state.epoch)
-    slots = functions.slots(stage, state.candidates)
+    slots = slots_of(searcher, state)
     learners, metrics = searcher.population.chunk(state.learners, slots, epoch)
     metrics = searcher.population.fetch(metrics)
     history = functions.record(state.history, metrics, epoch)
@@ -390,18 +247,34 @@ def _run_chunk(searcher: Searcher, state: SearchState) -> tuple[SearchState, Pro
     state = state.replace(
         learners=learners, history=history, epoch=jnp.asarray(after, jnp.int32)
     )
-    if after < config.train.num_epochs:
+    if after < config.epochs_of(stage):
         return state, progress
+    if stage == config.num_stages:
+        return _ended(searcher, state), progress
+    history = {name: value[:after] for name, value in history.items()}
     fetch = searcher.population.fetch
     frozen = jnp.stack([fetch(group.frozen) for group in learners])
     if config.final_rounds:
         history = _tracked(fetch(searcher.population.final(learners, slots)))
     es_state, result = functions.end(state.es, stage, state.candidates, history, frozen)
     progress = progress._replace(result=result, learners=learners)
-    if stage + 1 < config.num_stages:
+    if stage + 1 < config.total_stages and result.fitness.finite.any():
         return _begin_stage(searcher, es_state, stage + 1), progress
-    over = jnp.asarray(config.num_stages, jnp.int32)
-    return state.replace(es=es_state, stage=over), progress
+    return _ended(searcher, state.replace(es=es_state)), progress
+
+
+def _ended(searcher: Searcher, state: SearchState) -> SearchState:
+    """The state after the last stage; its learners are those of that stage."""
+    over = jnp.asarray(searcher.config.total_stages, jnp.int32)
+    return state.replace(stage=over)
+
+
+def slots_of(searcher: Searcher, state: SearchState) -> tuple[Slot, ...]:
+    """The slots in training."""
+    stage = int(state.stage)
+    if stage < searcher.config.num_stages:
+        return searcher.stage.slots(stage, state.candidates)
+    return searcher.stage.final_slots(state.candidates)
 
 
 def _tracked(metrics: tuple[Metrics, ...]) -> Metrics:
@@ -409,15 +282,12 @@ def _tracked(metrics: tuple[Metrics, ...]) -> Metrics:
     return {name: jnp.stack([group[name] for group in metrics], 1) for name in TRACKED}
 
 
-def pick_label(config: SearchConfig, is_zero: bool, ep_return: float) -> str:
+def pick_label(config: SearchConfig, is_zero: bool) -> str:
     """In words, by which rule the final pick of a search was made."""
     label = "zero violation, highest return" if is_zero else "lowest cost"
-    floor = config.return_floor
-    if floor is None:
+    if not config.return_share:
         return label
-    if ep_return < floor:
-        return f"highest return, as none reached {floor:g}"
-    return label if is_zero else f"{label} of those that return at least {floor:g}"
+    return f"{label} of those that keep {config.return_share:.0%} of the return"
 
 
 def require_survivors(config: SearchConfig, state: ESState) -> None:
@@ -429,7 +299,7 @@ def require_survivors(config: SearchConfig, state: ESState) -> None:
     stage = int(es_lib.failed_stage(state, config.population_size))
     if stage >= 0:
         raise RuntimeError(
-            f"every candidate of stage {stage} failed "
+            f"every candidate of stage {stage + 1} failed "
             "(non-finite numbers in all agents)"
         )
 
@@ -444,5 +314,5 @@ def best_of(config: SearchConfig, state: ESState) -> es_lib.Best:
     if not int(state.generation):
         raise RuntimeError("the search has no best candidate before its first stage")
     return es_lib.best(
-        state, config.population_size, config.zero_tolerance, config.return_floor
+        state, config.population_size, config.zero_tolerance, config.pool_scores
     )

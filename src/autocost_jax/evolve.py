@@ -49,7 +49,8 @@ def _main(argv: list[str]) -> None:
     config = options.search
     from autocost_jax.run import describe, run_search
 
-    path = options.out or Path("runs") / f"{options.preset}-seed{config.seed}"
+    name = f"{options.preset}-{config.train.env.name}-seed{config.seed}"
+    path = options.out or Path("runs") / name
     if options.dry_run:
         print("\n".join([*describe(config, len(devices)), f"would write to {path}"]))
         return
@@ -78,7 +79,7 @@ def _options_type() -> Any:
             flags default to the preset's values.
           config: run directory whose config.yaml replaces the preset's values.
           env: one of the worlds that `autocost info` lists.
-          out: run directory; default runs/PRESET-seedN.
+          out: run directory; default runs/PRESET-WORLD-seedN.
           resume: continue the run in `out` from its newest checkpoint.
           overwrite: start over in a directory that already holds a run.
           devices: devices to use; default: all; a CPU counts one a core.

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.agents.base import Agent, actor
+from autocost_jax.agents.base import Actor, Agent, actor
 from autocost_jax.arrays import RunDirError, load_arrays, unflatten
 from autocost_jax.config import TrainConfig
 from autocost_jax.envs.env import Env, make_env
@@ -43,16 +43,25 @@ def load_policies(train: TrainConfig, files: Sequence[Path]) -> tuple[Agent, Any
     Raises:
       RunDirError: a file is missing or is not such a policy.
     """
-    # Whose policy it is does not matter: all agents act alike.
-    (agent,) = make_agents(("ppo_lagrangian",), train, make_env(train.env))
-    template = agent.init(jax.random.key(0))
-    part = actor(template)
+    part = actor(_acting_agent(train).init(jax.random.key(0)))
     loaded = [unflatten(load_arrays(file, None), part) for file in files]
+    return policy_states(train, jax.tree.map(lambda *x: jnp.stack(x), *loaded))
+
+
+def policy_states(train: TrainConfig, actors: Actor) -> tuple[Agent, Any]:
+    """Actors [P, ...] as one stacked agent state, and the agent that acts for it."""
+    agent = _acting_agent(train)
+    size = jax.tree.leaves(actors)[0].shape[0]
     stacked = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (len(loaded), *leaf.shape)), template
+        lambda leaf: jnp.broadcast_to(leaf, (size, *leaf.shape)),
+        agent.init(jax.random.key(0)),
     )
-    acting = jax.tree.map(lambda *leaves: jnp.stack(leaves), *loaded)
-    return agent, dataclasses.replace(stacked, **acting._asdict())
+    return agent, dataclasses.replace(stacked, **actors._asdict())
+
+
+def _acting_agent(train: TrainConfig) -> Agent:
+    """Whose policy it is does not matter: all agents act alike."""
+    return make_agents(("ppo_lagrangian",), train, make_env(train.env))[0]
 
 
 def policy_files(path: Path, names: Sequence[str] = ()) -> list[Path]:

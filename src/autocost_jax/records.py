@@ -130,7 +130,7 @@ class EnvState(struct.PyTreeNode):
       task_distances: [...] the task's distances that the next reward starts from.
       cost_inputs: what a training cost may look at.
       metrics: counters since the reset: `goals_met`, `goal_move_failures`,
-        `distance_travelled` (metres).
+        `distance_travelled` (metres), `steps_outside` the arena.
       key: source of later goal moves.
     """
 
@@ -201,6 +201,7 @@ class EvalResult(struct.PyTreeNode):
       ep_return: [E] undiscounted return of each episode.
       ep_cost: [E] extrinsic cost of each episode.
       distance_travelled: [E] path length of each episode, metres.
+      outside_share: [E] share of the steps outside the arena.
       valid: [E] 1.0 where no number of the episode was non-finite.
       violation_rate: [] share of valid episodes with `ep_cost` > 0.
     """
@@ -208,5 +209,6 @@ class EvalResult(struct.PyTreeNode):
     ep_return: jax.Array
     ep_cost: jax.Array
     distance_travelled: jax.Array
+    outside_share: jax.Array
     valid: jax.Array
     violation_rate: jax.Array

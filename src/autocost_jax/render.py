@@ -20,7 +20,6 @@ from autocost_jax.policies import (
     EVALUATION,
     load_policies,
     policy_files,
-    policy_name,
     scripted_agent,
 )
 from autocost_jax.population import make_evaluator
@@ -85,7 +84,7 @@ def best_policy(run: Path) -> str | None:
     card = _card(run)
     if not card:
         return None
-    return policy_name(card["stage"], next(iter(card["evaluation"])))
+    return f"best_{next(iter(card['evaluation']))}"
 
 
 def run_player(
@@ -107,7 +106,7 @@ def run_player(
     agent, states = load_policies(train, [file])
     state = jax.tree.map(lambda leaf: leaf[0], states)
     card, theta = _card(run), None
-    if card and file.stem.startswith(policy_name(card["stage"], "")):
+    if card and file.stem.startswith("best_"):
         theta = load_arrays(run / "cost.npz", None)["theta"]
     return Player(
         world=train.env.name,

@@ -13,7 +13,8 @@ import jax
 import numpy as np
 
 from autocost_jax import cluster
-from autocost_jax.agents.base import actor
+from autocost_jax import es as es_lib
+from autocost_jax.agents.base import Actor, actor
 from autocost_jax.arrays import flatten
 from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import make_env
@@ -21,25 +22,33 @@ from autocost_jax.evolution import (
     Progress,
     Searcher,
     SearchState,
-    StageResult,
     best_of,
     evolve,
     init_search,
     make_searcher,
     pick_label,
     require_survivors,
+    slots_of,
+)
+from autocost_jax.outcome import (
+    BEST,
+    conclusion,
+    finalist_actors,
+    pick,
+    reference_places,
+    score_agents,
+    succeeded,
+    summary_rows,
+    table_lines,
 )
 from autocost_jax.policies import (
     EVALUATION,
-    eval_summary,
     load_policies,
     policy_name,
     require_episodes,
-    score_line,
 )
-from autocost_jax.population import make_evaluator
-from autocost_jax.progress import Display, format_seconds, summarise
-from autocost_jax.scene import first_recording, watch_first
+from autocost_jax.progress import Display, format_seconds, stage_lines, summarise
+from autocost_jax.stages import StageResult
 from autocost_jax.store import (
     RunDir,
     SilentRun,
@@ -57,7 +66,7 @@ def estimate_memory(config: SearchConfig, num_devices: int) -> int:
     read it slot-first), and four copies of parameters and optimiser moments.
     """
     env = make_env(config.train.env)
-    slots = config.population_size * len(config.algorithms)
+    slots = config.slots_per_algorithm * len(config.algorithms)
     row = env.observation_size + 2 * env.action_size + 24
     rows = config.train.num_worlds * env.episode_length
     sizes = (env.observation_size, *config.train.agent.hidden_sizes, env.action_size)
@@ -67,7 +76,7 @@ def estimate_memory(config: SearchConfig, num_devices: int) -> int:
     activations = 4 * batch * width * len(config.train.agent.hidden_sizes)
     per_slot = 2 * row * rows + 4 * 3 * 3 * weights
     here = -(-slots // num_devices)
-    at_once = slots_at_once(config.train, -(-config.population_size // num_devices))
+    at_once = slots_at_once(config.train, -(-config.slots_per_algorithm // num_devices))
     return 4 * (per_slot * here + activations * at_once)
 
 
@@ -79,7 +88,7 @@ def estimate_disk(config: SearchConfig) -> int:
     weights = sum(
         (a + 1) * b for sizes in networks for a, b in itertools.pairwise(sizes)
     )
-    slots = config.population_size * len(config.algorithms)
+    slots = config.slots_per_algorithm * len(config.algorithms)
     return 4 * 4 * 3 * weights * slots  # float32 parameters and two Adam moments
 
 
@@ -155,7 +164,7 @@ def run_search(
       RuntimeError: every candidate of a stage failed.
     """
     require_episodes(num_episodes)
-    devices = useful_devices(devices, config.population_size, "candidates")
+    devices = useful_devices(devices, config.slots_per_algorithm, "slots")
     check_memory(config, devices)
     searcher = make_searcher(config, devices)
     run = open_run(path, config, resume=resume, overwrite=overwrite)
@@ -163,7 +172,7 @@ def run_search(
         for line in [*run.warnings, *describe(config, len(devices))]:
             display.say(line)
         state = _start(run, searcher, display, resume)
-        if int(state.stage) < config.num_stages:
+        if int(state.stage) < config.total_stages:
             _compile(searcher, state, display)
         state = _train(run, searcher, state, display)
         if isinstance(run, RunDir):
@@ -237,18 +246,19 @@ def _start(
 
 
 def _compile(searcher: Searcher, state: SearchState, display: Display) -> None:
-    display.say("compiling the population program ...")
     start = time.monotonic()
-    slots = searcher.stage.slots(int(state.stage), state.candidates)
-    searcher.population.compile(state.learners, slots)
+    slots = slots_of(searcher, state)
+    with display.working("compiling the population program"):
+        searcher.population.compile(state.learners, slots)
     display.say(f"compiled in {time.monotonic() - start:.1f} s")
 
 
 def _steps_done(config: SearchConfig, state: SearchState) -> int:
-    epochs = int(state.stage) * config.train.num_epochs
-    if int(state.stage) < config.num_stages:
+    stage = int(state.stage)
+    epochs = sum(config.epochs_of(before) for before in range(stage))
+    if stage < config.total_stages:
         epochs += int(state.epoch)
-    return epochs * config.env_steps // (config.num_stages * config.train.num_epochs)
+    return epochs * config.epoch_env_steps
 
 
 def _train(
@@ -256,20 +266,13 @@ def _train(
 ) -> SearchState:
     config = run.config
     chunk = config.train.chunk_epochs
-    chunk_steps = config.env_steps // (config.num_stages * config.train.num_epochs)
     display.start_clock()
     for after, progress in evolve(config, state=state, searcher=searcher):
         state = after
         first = progress.stage * config.train.num_epochs + progress.epoch
         display.update(
-            summarise(
-                progress.stage,
-                config.num_stages,
-                progress.epoch + chunk,
-                config.train.num_epochs,
-                progress.metrics,
-            ),
-            chunk_steps * chunk,
+            summarise(config, progress.stage, progress.epoch + chunk, progress.metrics),
+            config.epoch_env_steps * chunk,
         )
         for k in range(chunk):
             row: dict[str, Any] = {"stage": progress.stage, "epoch": progress.epoch + k}
@@ -279,6 +282,8 @@ def _train(
             run.log_metrics(row, first + k)
         if progress.result is not None:
             _write_stage(run, searcher, state, progress, progress.result)
+            for line in stage_lines(config, progress.stage, progress.result):
+                display.say(line)
         position = {"stage": int(state.stage), "epoch": int(state.epoch)}
         saved = state.replace(learners=searcher.population.fetch(state.learners))
         run.save_checkpoint(saved, first + chunk, position)
@@ -295,10 +300,14 @@ def _write_stage(
     """The stage's npz and the policies of its best candidate."""
     config = run.config
     scores = {f"scores/{key}": value for key, value in result.scores.items()}
+    scores |= {f"references/{key}": x for key, x in result.references.items()}
     arrays = {
         "theta": result.candidates,
         "cost": result.fitness.cost,
         "ep_return": result.fitness.ep_return,
+        "floor": result.fitness.floor
+        if result.fitness.floor is not None
+        else np.full(config.population_size, -np.inf, np.float32),
         "order": result.order,
         "frozen": result.frozen,
         "elites": state.es.elites,
@@ -312,7 +321,7 @@ def _write_stage(
     run.write_stage(progress.stage, arrays)
     if not np.asarray(result.fitness.finite).any():
         return  # no candidate is the best
-    top = int(result.order[0])
+    top = int(result.order[0]) * config.seeds_per_candidate  # its first seed
     for name, learner in zip(config.algorithms, progress.learners, strict=True):
         policies = searcher.population.fetch(actor(learner.agent))
         params = jax.tree.map(lambda leaf: leaf[top], policies)
@@ -326,52 +335,80 @@ def _finish(
     display: Display,
     num_episodes: int,
 ) -> Path:
-    """Name the best cost, evaluate its agents on fresh layouts, write the report."""
+    """Judge the finalists on fresh layouts, name the best cost, write the report."""
     from autocost_jax.report import write_report
     from autocost_jax.summary import load_report
 
     config = run.config
-    best = best_of(config, state.es)
-    stage = int(best.generation)
-    display.say(f"evaluating the best cost over {num_episodes} fresh episodes ...")
+    best_of(config, state.es)  # refuses a failed search
+    actors, num_seeds, places = _contenders(run, searcher, state)
+    key = jax.random.fold_in(searcher.root, EVALUATION)
+    what = f"evaluating over {num_episodes} fresh episodes an agent"
+    with display.working(what) as tell:
+        scores = score_agents(config.train, actors, num_seeds, key, num_episodes, tell)
+    chosen = pick(config, scores)
+    rows = summary_rows(config, scores, chosen, num_episodes)
+    stage, index = divmod(int(places[chosen]), config.population_size)
+    costs = reference_places(config) | {BEST: chosen}
+    for cost, place in costs.items():
+        for a, name in enumerate(config.algorithms):
+            acting = jax.tree.map(
+                lambda leaf, at=place * num_seeds: leaf[at], actors[a]
+            )
+            run.write_policy(f"{cost}_{name}", flatten(acting))
+            recording = scores.recordings[a][place]._asdict()
+            run.write_arrays(f"replay_{cost}_{name}", recording)
+    row = int(places[chosen])
+    theta = np.asarray(state.es.archive[row])
+    is_zero = all(r["violation_rate"] == 0 for r in rows if r["cost"] == BEST)
+    card = {
+        "label": pick_label(config, is_zero),
+        "environment": config.train.env.name,
+        "stage": stage,
+        "index": index,
+        "search_cost": float(state.es.archive_fitness.cost[row]),
+        "search_return": float(state.es.archive_fitness.ep_return[row]),
+        "env_steps": config.env_steps,
+        "seed": config.seed,
+        "evaluation": {r["algorithm"]: r for r in rows if r["cost"] == BEST},
+    }
+    run.write_cost({"theta": theta}, card)
+    text = conclusion(rows, config.train.env.num_steps)
+    is_success = bool(reference_places(config)) and succeeded(rows)
+    run.write_json(
+        "summary", {"rows": rows, "succeeded": is_success, "conclusion": text}
+    )
+    report = write_report(load_report(run.path), run.path / "report" / "index.html")
+    display.say(f"best cost: candidate {index + 1} of stage {stage + 1}")
+    for line in [*table_lines(rows), text]:
+        display.say(line)
+    display.say(f"done in {format_seconds(display.elapsed)}; open {report}")
+    return report
+
+
+def _contenders(
+    run: RunDir, searcher: Searcher, state: SearchState
+) -> tuple[list[Actor], int, np.ndarray]:
+    """Whose episodes decide: for each algorithm actors [C x S, ...]; S; and the places
+    of the first costs in the archive.
+
+    Without a stage of finalists it is the agent of the best candidate that its stage
+    left, one seed.
+    """
+    config = run.config
+    _, order = es_lib.top(
+        state.es,
+        max(1, config.num_finalists),
+        config.zero_tolerance,
+        config.pool_scores,
+    )
+    if config.num_finalists:
+        learners = searcher.population.fetch(state.learners)
+        return *finalist_actors(config, learners), np.asarray(order)
+    stage = int(order[0]) // config.population_size
     files = [
         run.path / "policies" / f"{policy_name(stage, name)}.npz"
         for name in config.algorithms
     ]
-    agent, states = load_policies(config.train, files)
-    env = make_env(config.train.env)
-    key = jax.random.fold_in(searcher.root, EVALUATION)
-    evaluator = make_evaluator(env, agent, num_episodes, watch=watch_first)
-    results, episodes = evaluator(states, key)
-    card = {
-        "label": pick_label(config, bool(best.zero_violation), float(best.ep_return)),
-        "environment": config.train.env.name,
-        "stage": stage,
-        "index": int(best.index),
-        "search_cost": float(best.cost),
-        "search_return": float(best.ep_return),
-        "env_steps": config.env_steps,
-        "seed": config.seed,
-        "evaluation": {
-            name: eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
-            for i, name in enumerate(config.algorithms)
-        },
-    }
-    run.write_cost({"theta": np.asarray(best.candidate)}, card)
-    first = first_recording(jax.tree.map(lambda leaf: leaf[0], episodes))
-    run.write_arrays("replay", first._asdict())
-    report = write_report(load_report(run.path), run.path / "report" / "index.html")
-    for line in finish_lines(card, report, display.elapsed):
-        display.say(line)
-    return report
-
-
-def finish_lines(card: dict[str, Any], report: Path, elapsed: float) -> list[str]:
-    """What a finished run says last."""
-    lines = [
-        f"best cost: stage {card['stage'] + 1}, candidate {card['index']} "
-        f"({card['label']})"
-    ]
-    for name, row in card["evaluation"].items():
-        lines.append("  " + score_line(name, row))
-    return [*lines, f"done in {format_seconds(elapsed)}; open {report}"]
+    loaded = (load_policies(config.train, [file])[1] for file in files)
+    return [actor(state) for state in loaded], 1, np.asarray(order)

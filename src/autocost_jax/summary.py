@@ -14,14 +14,16 @@ from autocost_jax.evolution import pick_label
 from autocost_jax.report import (
     BestCandidate,
     Curve,
+    ReferenceScore,
     ReportData,
     StageRecord,
     SummaryRow,
     network_cost,
 )
-from autocost_jax.report_assets.data import NAMES
+from autocost_jax.report_assets.data import COST_NAMES, NAMES
 from autocost_jax.report_assets.replay import Replay
 from autocost_jax.scene import Recording, make_replay
+from autocost_jax.stages import REFERENCES
 from autocost_jax.store import list_stages, read_config, read_metrics
 
 
@@ -35,9 +37,9 @@ def load_report(path: str | Path) -> ReportData:
     config, facts = read_config(path, SearchConfig)
     rows = read_metrics(path)
     stages = tuple(_stage(config, file) for file in list_stages(path).values())
-    card = _read_card(path)
+    card = _read_json(path / "cost.json")
     best = _best(config, stages, card)
-    evaluation = {} if best is None else card.get("evaluation", {})
+    summary = {} if best is None else _read_json(path / "summary.json")
     obstacle = config.train.env.constrained[0]
     return ReportData(
         title=f"AutoCost on {config.train.env.name}",
@@ -52,21 +54,59 @@ def load_report(path: str | Path) -> ReportData:
         replays=() if best is None else _replays(path, config),
         summary=tuple(
             SummaryRow(
-                algorithm=name,
-                cost="best",
-                ep_return=row["return_mean"],
-                ep_cost=row["cost_mean"],
+                algorithm=row["algorithm"],
+                cost=row["cost"],
+                ep_return=row["return"],
+                ep_cost=row["ep_cost"],
                 violation_rate=row["violation_rate"],
-                seeds=1,
+                outside_share=row["outside_share"],
+                seeds=row["seeds"],
                 episodes=row["episodes"],
             )
-            for name, row in evaluation.items()
+            for row in summary.get("rows", ())
         ),
+        conclusion=summary.get("conclusion", ""),
+        references=tuple(
+            score
+            for number, file in enumerate(list_stages(path).values())
+            for score in _references(config, number, load_arrays(file))
+        ),
+        can_violate=_can_violate(config, rows),
     )
 
 
-def _read_card(path: Path) -> dict[str, Any]:
-    file = path / "cost.json"
+def _references(
+    config: SearchConfig, number: int, arrays: dict[str, np.ndarray]
+) -> list[ReferenceScore]:
+    """What the reference costs of a stage came to."""
+    if not config.references:
+        return []
+    length = config.train.env.num_steps
+    return [
+        ReferenceScore(
+            stage=number,
+            algorithm=name,
+            cost=cost,
+            ep_return=float(arrays["references/ep_return"][a, r]),
+            ep_cost=float(arrays["references/ep_cost"][a, r]),
+            violation_rate=float(arrays["references/violating_worlds"][a, r]),
+            outside_share=float(arrays["references/steps_outside"][a, r]) / length,
+        )
+        for a, name in enumerate(config.algorithms)
+        for r, cost in enumerate(REFERENCES)
+    ]
+
+
+def _can_violate(config: SearchConfig, rows: list[dict[str, Any]]) -> bool:
+    """Whether any agent of the run has ever violated; True while there are no rows.
+
+    Where none has, not even in its first epochs, episodes are too short for it.
+    """
+    names = [f"{name}/violating_worlds" for name in config.algorithms]
+    return not rows or any(np.max(row[name]) > 0 for row in rows for name in names)
+
+
+def _read_json(file: Path) -> dict[str, Any]:
     if not file.exists():
         return {}
     try:
@@ -91,6 +131,8 @@ def _stage_record(config: SearchConfig, arrays: dict[str, np.ndarray]) -> StageR
         algorithm_cost=arrays["scores/ep_cost"],
         algorithm_return=arrays["scores/ep_return"],
         zero_violation=arrays["cost"] <= config.zero_tolerance,
+        violation_rate=arrays["scores/violating_worlds"],
+        outside_share=arrays["scores/steps_outside"] / config.train.env.num_steps,
         elites=np.asarray([match[0] for match in parents]),
         far_cost=_known_mean(arrays["scores/intrinsic_far"]),
         near_cost=_known_mean(arrays["scores/intrinsic_near"]),
@@ -118,7 +160,7 @@ def _best(
         for name in ("cost", "ep_return")
     )
     fitness = Fitness(jnp.asarray(costs), jnp.asarray(returns))
-    first = int(rank(fitness, config.zero_tolerance, config.return_floor)[0])
+    first = int(rank(fitness, config.zero_tolerance)[0])
     number, index = divmod(first, config.population_size)
     number, index = card.get("stage", number), card.get("index", index)
     stage = stages[number]
@@ -128,7 +170,7 @@ def _best(
         stage=number,
         index=index,
         theta=stage.theta[index],
-        label=pick_label(config, is_zero, float(stage.ep_return[index])),
+        label=pick_label(config, is_zero),
         card=tuple(f"{key}: {card[key]}" for key in shown if key in card),
     )
 
@@ -156,20 +198,27 @@ def _curves(config: SearchConfig, rows: list[dict[str, Any]]) -> list[Curve]:
 
 
 def _replays(path: Path, config: SearchConfig) -> tuple[Replay, ...]:
-    file, cost = path / "replay.npz", path / "cost.npz"
-    if not (file.exists() and cost.exists()):
+    """The recordings that the run has left, those of the best cost first."""
+    cost = path / "cost.npz"
+    if not cost.exists():
         return ()
-    arrays: dict[str, Any] = dict(load_arrays(file, None))
-    if arrays.keys() != set(Recording._fields):
-        return ()  # written by an earlier version, which kept no joint positions
     theta = load_arrays(cost, None)["theta"]
-    replay = make_replay(
-        config.train.env,
-        Recording(**arrays),
-        intrinsic=network_cost(theta, arrays["constraint_lidar"]),
-        label=f"{NAMES.get(config.algorithms[0], config.algorithms[0])}, best cost",
-    )
-    return (replay,)
+    replays = []
+    for kind in ("best", *REFERENCES):
+        for name in config.algorithms:
+            file = path / f"replay_{kind}_{name}.npz"
+            if not file.exists():
+                continue
+            arrays: dict[str, Any] = dict(load_arrays(file, None))
+            seen = network_cost(theta, arrays["constraint_lidar"])
+            replay = make_replay(
+                config.train.env,
+                Recording(**arrays),
+                intrinsic=seen if kind == "best" else None,
+                label=f"{NAMES.get(name, name)}, {COST_NAMES[kind]}",
+            )
+            replays.append(replay)
+    return tuple(replays)
 
 
 def _config_lines(

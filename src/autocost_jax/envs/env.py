@@ -176,6 +176,7 @@ def _reset_to(parts: _Parts, layout: Layout, key: Key) -> EnvState:
             "goals_met": jnp.zeros((), jnp.int32),
             "goal_move_failures": jnp.zeros((), jnp.int32),
             "distance_travelled": zero,
+            "steps_outside": jnp.zeros((), jnp.int32),
         },
         key=key,
     )
@@ -242,6 +243,7 @@ def _step(parts: _Parts, state: EnvState, action: jax.Array) -> EnvState:
             "goal_move_failures": counters["goal_move_failures"] + (is_met & ~is_valid),
             "distance_travelled": counters["distance_travelled"]
             + jnp.sqrt((travelled**2).sum()),
+            "steps_outside": counters["steps_outside"] + is_outside(config, layout),
         },
     )
     return _silence(state, new_state, state.failed | ~_is_finite(new_state))
@@ -260,6 +262,12 @@ def _update_layout(parts: _Parts, layout: Layout, bodies: Bodies) -> Layout:
         vases = bodies.vases[:, :2]
         layout = layout.replace(vases=vases, vases_yaw=bodies.vases_yaw)
     return layout
+
+
+def is_outside(config: EnvConfig, layout: Layout) -> jax.Array:
+    """[] whether the robot's origin is outside the arena that things are placed in."""
+    low, high = np.split(np.asarray(config.placements_extents), 2)
+    return ((layout.robot_xy < low) | (layout.robot_xy > high)).any()
 
 
 def _objects(layout: Layout, kind: str) -> jax.Array:
