@@ -164,7 +164,7 @@ def measure_ours(case: Case, devices: Sequence[Any]) -> Speed:
     algorithm, passes = case.train
     train = preset("laptop").train
     agent = dataclasses.replace(train.agent, value_passes=passes)
-    train = dataclasses.replace(train, env=env, agent=agent)
+    train = dataclasses.replace(train, env=env, agent=agent, num_worlds=8)
     return slot_speeds(train, algorithm, (SLOTS,), devices)[0]
 
 

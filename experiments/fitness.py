@@ -1,13 +1,13 @@
 """Which fitness tells the truth? Rank correlation of a stage's scores with the truth.
 
-    python experiments/fitness.py run      # trains everything; an hour on a GPU's worth
+    python experiments/fitness.py run      # trains everything: four minutes of an H100
     python experiments/fitness.py collect  # JSON, table
 
 Random costs of the paper's network are trained three times, with other seeds each time:
 
     truth   from scratch for 2,000,000 steps, 5 seeds, then 200 fresh episodes each
-    short   from scratch for 768,000 steps, 5 seeds: what a stage of a search sees
-    warm    for 512,000 steps more from one policy an algorithm and seed, trained with
+    short   from scratch for 512,000 steps, 5 seeds: what a stage of a search sees
+    warm    for 256,000 steps more from one policy an algorithm and seed, trained with
             the extrinsic cost alone in `short`
 
 A rule of a search is a length, a number of seeds, episodes that count, and a way to
@@ -17,6 +17,7 @@ trained beside them as references.
 """
 
 import argparse
+import itertools
 import json
 import time
 from pathlib import Path
@@ -38,6 +39,7 @@ from autocost_jax.population import Population, make_agents, make_population
 from autocost_jax.records import Slot
 from autocost_jax.rollout import typical_lidars
 from autocost_jax.store import run_facts
+from common import compact
 
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 REFERENCES = ("extrinsic", "extrinsic+safety_margin_3x")
@@ -197,20 +199,145 @@ def run(path: Path, size: Size, config: TrainConfig, seconds: float) -> None:
     (path / "facts.json").write_text(json.dumps(facts, indent=1, default=str))
 
 
+class Rule(NamedTuple):
+    """How a stage could judge: what it trains, for how long, with how many seeds.
+
+    Attributes:
+      training: "short" (from scratch) or "warm".
+      epochs: of 4000 steps; the last quarter counts, 16 at most.
+      seeds: of each candidate.
+    """
+
+    training: str
+    epochs: int
+    seeds: int
+
+    @property
+    def budget(self) -> int:
+        """Env steps of a candidate and algorithm."""
+        return 4000 * self.epochs * self.seeds
+
+
+RULES = [
+    *(Rule("short", e, s) for e in (16, 32, 48, 64, 96, 128) for s in (1, 2, 3, 5)),
+    *(Rule("warm", e, s) for e in (16, 32, 48, 64) for s in (1, 2, 3, 5)),
+]
+CPU_STEPS_A_MINUTE = 45_000 * 60  # what two cores train, see results/laptop
+
+
+def judged(arrays: Any, rule: Rule, seeds: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Cost, return and violating episodes [A, C], as a rule would see them."""
+    count = min(16, rule.epochs // 4)
+    last = slice(rule.epochs - count, rule.epochs)
+    return {
+        name: arrays[f"{rule.training}/{key}"][last].mean(0)[..., seeds].mean(-1)
+        for name, key in (("cost", "ep_cost"), ("return", "ep_return"))
+    }
+
+
+def correlations(arrays: Any, rule: Rule, graded: np.ndarray) -> dict[str, Any]:
+    """Spearman between a rule's scores and the truth, means over choices of seeds."""
+    from scipy.stats import spearmanr
+
+    truth = {
+        "cost": arrays["evaluation/ep_cost"].mean((2, 3)),
+        "return": arrays["evaluation/ep_return"].mean((2, 3)),
+    }
+    choices = list(itertools.combinations(range(5), rule.seeds))
+    scores = [judged(arrays, rule, seeds) for seeds in choices]
+    rng = np.random.default_rng(0)
+    draws = [graded, *(rng.choice(graded, len(graded)) for _ in range(200))]
+
+    def spearman(name: str, reduce: Any) -> dict[str, float]:
+        values = [
+            np.mean(
+                [
+                    spearmanr(reduce(s[name])[at], reduce(truth[name])[at]).statistic
+                    for s in scores
+                ]
+            )
+            for at in draws
+        ]
+        low, high = np.percentile(values[1:], [2.5, 97.5])
+        return {"mean": float(values[0]), "low": float(low), "high": float(high)}
+
+    return {
+        **rule._asdict(),
+        "budget": rule.budget,
+        "cpu_minutes_for_ten": 2 * 10 * rule.budget / CPU_STEPS_A_MINUTE,
+        "cost": spearman("cost", lambda x: x.mean(0)),
+        "worst_cost": spearman("cost", lambda x: x.max(0)),
+        "return": spearman("return", lambda x: x.mean(0)),
+        "worst_return": spearman("return", lambda x: x.min(0)),
+    }
+
+
+def collect(path: Path, results: Path) -> None:
+    """JSON and table: rank correlation of every rule with the truth."""
+    with np.load(path / "fitness.npz") as file:
+        arrays = {name: file[name] for name in file.files}
+    size = Size()
+    graded = np.arange(len(REFERENCES), len(REFERENCES) + size.graded)
+    rows = [correlations(arrays, rule, graded) for rule in RULES]
+    evaluation = {
+        name: arrays[f"evaluation/{name}"] for name in ("ep_return", "ep_cost")
+    }
+    truth = {
+        "return": evaluation["ep_return"].mean((2, 3)).round(3).tolist(),
+        "ep_cost": evaluation["ep_cost"].mean((2, 3)).round(4).tolist(),
+        "violation_rate": (evaluation["ep_cost"] > 0).mean((2, 3)).round(4).tolist(),
+    }
+    result = {
+        "command": "python experiments/fitness.py run && "
+        "python experiments/fitness.py collect",
+        **json.loads((path / "facts.json").read_text()),
+        "costs": [*REFERENCES, *["graded"] * size.graded, *["normal"] * size.normal],
+        "theta": arrays["theta"].round(5).tolist(),
+        "truth": truth,
+        "rules": rows,
+    }
+    results.mkdir(parents=True, exist_ok=True)
+    (results / "fitness.json").write_text(compact(result) + "\n")
+    (results / "fitness.md").write_text(table(rows))
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """One line a rule."""
+    lines = [
+        "| training | epochs | seeds | CPU minutes for 10 candidates | cost (95 %) | "
+        "cost of the worse agent | return | return of the worse agent |",
+        "|---" * 8 + "|",
+    ]
+    for row in rows:
+        cells = [
+            f"{row[name]['mean']:.2f} ({row[name]['low']:.2f} to "
+            f"{row[name]['high']:.2f})"
+            for name in ("cost", "worst_cost", "return", "worst_return")
+        ]
+        head = f"| {row['training']} | {row['epochs']} | {row['seeds']} | "
+        minutes = f"{row['cpu_minutes_for_ten']:.1f}"
+        lines.append(f"{head}{minutes} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=("run", "collect"))
     parser.add_argument("--out", type=Path, default=Path("runs/fitness"))
+    results = Path("experiments/results/fitness")
+    parser.add_argument("--results", type=Path, default=results)
     parser.add_argument("--smoke", action="store_true")
     parser.add_argument("--seconds", type=float, default=np.inf)
     args = parser.parse_args()
+    if args.part == "collect":
+        collect(args.out, args.results)
+        return
     args.out.mkdir(parents=True, exist_ok=True)
     use_devices(None)
-    config = preset("laptop").train
-    env = EnvConfig(physics="closed_form")
-    if args.smoke:
-        env = EnvConfig(physics="closed_form", num_steps=100)
-    config = TrainConfig(env=env, agent=config.agent, num_worlds=config.num_worlds, num_epochs=1)
+    env = EnvConfig(physics="closed_form", num_steps=100 if args.smoke else 1000)
+    agent = preset("laptop").train.agent
+    config = TrainConfig(env=env, agent=agent, num_worlds=4, num_epochs=1)
     run(args.out, SMOKE if args.smoke else Size(), config, args.seconds)
 
 

@@ -11,6 +11,7 @@ with a margin of 2x and 3x. Scores are of 200 fresh episodes a seed, actions sam
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import subprocess
@@ -30,6 +31,7 @@ from autocost_jax.evaluate import evaluate
 from autocost_jax.methods import Method, TableConfig, table_slots
 from autocost_jax.population import make_agents, make_population
 from autocost_jax.store import run_facts
+from common import compact, t_interval
 
 STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
 COSTS = ("extrinsic", "extrinsic+safety_margin_2x", "extrinsic+safety_margin_3x")
@@ -46,20 +48,14 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "as before": (8, 1, {}),
     "normalised": (8, 1, NORM),
     "4 worlds": (4, 1, NORM),
+    "4 worlds, multiplier lr 0.02": (4, 1, NORM | {"multiplier_lr": 0.02}),
+    "4 worlds in 4 cohorts": (4, 4, NORM),
     "2 worlds": (2, 1, NORM),
     "4 worlds, KL 0.02": (4, 1, NORM | {"target_kl": 0.02}),
-    "4 worlds, multiplier lr 0.02": (4, 1, NORM | {"multiplier_lr": 0.02}),
-    "4 worlds, multiplier <= 2": (4, 1, NORM | {"multiplier_max": 2.0}),
-    "4 worlds in 4 cohorts": (4, 4, NORM),
     "4 worlds, log std -1": (4, 1, NORM | {"log_std_init": -1.0}),
     "4 worlds, lr 1e-3": (4, 1, NORM | {"policy_lr": 1e-3, "value_lr": 3e-3}),
-    "4 worlds, lambda 0.95": (
-        4,
-        1,
-        NORM | {"gae_lambda": 0.95, "cost_gae_lambda": 0.95},
-    ),
-    "2 worlds, KL 0.02": (2, 1, NORM | {"target_kl": 0.02}),
 }
+ALGORITHMS = ("ppo_lagrangian", "cpo")
 
 
 def config_of(name: str, steps: int = STEPS, episode: int = 1000) -> TableConfig:
@@ -147,15 +143,75 @@ def run_all(names: list[str], out: Path, smoke: bool) -> None:
         raise SystemExit(f"{len(failed)} settings failed: {failed}")
 
 
+def collect(out: Path, results: Path) -> None:
+    """JSON and table of the settings that have been run."""
+    files = [out / f"{name.replace(' ', '_')}.json" for name in SETTINGS]
+    done = [json.loads(file.read_text()) for file in files if file.exists()]
+    settings = []
+    for run in done:
+        scores = []
+        for algorithm, cost in itertools.product(ALGORITHMS, COSTS):
+            rows = [
+                row
+                for row in run["rows"]
+                if (row["algorithm"], row["cost"]) == (algorithm, cost)
+            ]
+            scores.append(
+                {
+                    "algorithm": algorithm,
+                    "cost": cost,
+                    "return": t_interval([row["return"] for row in rows]),
+                    "ep_cost": t_interval([row["ep_cost"] for row in rows]),
+                    "violation_rate": t_interval(
+                        [row["violation_rate"] for row in rows]
+                    ),
+                }
+            )
+        kept = ("setting", "epochs", "worlds", "segments", "agent", "facts", "rows")
+        settings.append({**{key: run[key] for key in kept}, "scores": scores})
+    result = {
+        "command": "python experiments/learners.py run && "
+        "python experiments/learners.py collect",
+        "steps": STEPS,
+        "episodes": EPISODES,
+        "settings": settings,
+    }
+    results.mkdir(parents=True, exist_ok=True)
+    (results / "learners.json").write_text(compact(result) + "\n")
+    (results / "learners.md").write_text(table(settings))
+
+
+def table(settings: list[dict[str, Any]]) -> str:
+    """One row a setting: return at share of violating episodes, means of the seeds."""
+    names = ("extrinsic alone", "with a margin of 2x", "3x")
+    titles = [f"{name} {cost}" for name in ("PPO-Lag", "CPO") for cost in names]
+    lines = ["| setting | " + " | ".join(titles) + " |", "|---" * 7 + "|"]
+    for run in settings:
+        cells = []
+        for row in run["scores"]:
+            low, high = row["return"]["low"], row["return"]["high"]
+            rate = row["violation_rate"]["mean"]
+            cells.append(
+                f"{row['return']['mean']:.1f} ({low:.1f} to {high:.1f}) at {rate:.0%}"
+            )
+        lines.append(f"| {run['setting']} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=("run", "collect"))
     parser.add_argument("--only", nargs="+", choices=SETTINGS, default=list(SETTINGS))
     parser.add_argument("--out", type=Path, default=Path("runs/learners"))
+    results = Path("experiments/results/learners")
+    parser.add_argument("--results", type=Path, default=results)
     parser.add_argument("--smoke", action="store_true")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
+    if args.part == "collect":
+        collect(args.out, args.results)
+        return
     if len(args.only) == 1:
         run_one(args.only[0], args.out, args.smoke)
     else:

@@ -89,10 +89,10 @@ def test_a_timed_call_can_be_one_epoch(monkeypatch, tmp_path):
 def test_update_speed_is_the_difference_of_two_programs(rates):
     train = preset("laptop").train
     row = update_speed(train, "cpo", 3, jax.devices()[:1])
-    assert row.seconds == 12.0  # 24,000 steps at 1000 less at 2000 a second
+    assert row.seconds == 6.0  # 12,000 steps at 1000 less at 2000 a second
     flop = 3 * update_flop(train, "cpo", make_env(train.env))
     assert row.tera_flop == round(flop / 1e12, 4)
-    assert row.share == round(flop / 12.0 / 1e12, 3)
+    assert row.share == round(flop / 6.0 / 1e12, 3)
 
 
 @pytest.mark.parametrize(("there", "taken"), [(1, [1]), (3, [1, 2]), (8, [1, 2, 4, 8])])

@@ -113,6 +113,7 @@ BAD = {
         "value_passes": COUNT,
         "value_minibatches": COUNT,
         "critic_precision": ("float16", "", 32),
+        "normalize_obs": (1, "yes"),
         "cg_iterations": COUNT,
         "backtrack_steps": COUNT,
         "backtrack_ratio": (0.0, 1.0, -0.5, NAN),
@@ -139,10 +140,15 @@ BAD = {
         "zero_tolerance": NOT_NEGATIVE,
         "selection": ("best", ""),
         "start": ("uniform", ""),
-        "keep_level": (1, "yes"),
-        "return_floor": FINITE,
-        "judge_by": ("best", ""),
         "network": ("wide", ""),
+        "seeds_per_candidate": COUNT,
+        "references": (1, "yes"),
+        "judge_by": ("best", ""),
+        "return_share": (0.3, *NOT_NEGATIVE),  # 0.3 needs references
+        "pool_scores": (1, "yes"),
+        "num_finalists": (*NUMBER, 51),
+        "final_seeds": COUNT,
+        "final_epochs": NUMBER,
     },
 }
 CASES = [
@@ -208,11 +214,11 @@ def sizes(config: SearchConfig) -> dict[str, object]:
 # The table of sizes: what each preset promises.
 PROMISED = {
     "laptop": {
-        "candidates": 8,
+        "candidates": 10,
         "elites": 2,
-        "stages": 3,
-        "init_std": 5.0,
-        "worlds": 8,
+        "stages": 2,
+        "init_std": 8.0,
+        "worlds": 4,
         "steps": 1000,
         "nets": (64, 64),
         "policy": (6, 8),
@@ -221,8 +227,8 @@ PROMISED = {
     "search": {
         "candidates": 50,
         "elites": 5,
-        "stages": 5,
-        "worlds": 30,
+        "stages": 4,
+        "worlds": 4,
         "steps": 1000,
         "nets": (64, 64),
     },
@@ -246,8 +252,8 @@ PROMISED = {
         "nets": (16, 16),
     },
 }
-EPOCHS = {"search": 33, "paper": 333, "smoke": 2}  # laptop: what fits in 8 minutes
-FITNESS_EPOCHS = {"laptop": 3, "search": 10, "paper": 10, "smoke": 1}
+EPOCHS = {"search": 128, "paper": 333, "smoke": 2}  # laptop: what fits in 8 minutes
+FITNESS_EPOCHS = {"laptop": 18, "search": 32, "paper": 10, "smoke": 1}
 
 
 @pytest.mark.parametrize("name", PROMISED)
@@ -269,6 +275,28 @@ def test_the_paper_preset_keeps_the_papers_hyperparameters():
     assert (agent.gamma, agent.gae_lambda) == (0.99, 0.97)
     # 7 stages x 50 candidates x 2 algorithms x 333 epochs x 30 000 steps
     assert preset("paper").env_steps == 7 * 50 * 2 * 333 * 30_000
+
+
+def test_the_paper_preset_has_none_of_our_options():
+    config = preset("paper")
+    assert config == SearchConfig(train=dataclasses.replace(TrainConfig(), chunk_epochs=3))
+    assert (config.start, config.return_share) == ("normal", 0.0)
+    assert not (config.references or config.pool_scores or config.num_finalists)
+    assert config.slots_per_algorithm == config.population_size
+    assert config.total_stages == config.num_stages
+
+
+def test_the_finalists_train_in_the_slots_of_a_stage():
+    config = SearchConfig(
+        population_size=4, num_elites=1, references=True, num_finalists=2
+    )
+    assert config.slots_per_algorithm == (2 + 2) * 3  # more than the (4 + 2) of a stage
+    more = dataclasses.replace(config, seeds_per_candidate=3)
+    assert more.slots_per_algorithm == (4 + 2) * 3
+    assert [more.epochs_of(stage) for stage in range(8)] == [333] * 8
+    longer = dataclasses.replace(more, final_epochs=400)
+    assert [longer.epochs_of(stage) for stage in (6, 7)] == [333, 400]
+    assert longer.env_steps == (7 * 333 + 400) * 18 * 2 * 30_000
 
 
 def test_an_unknown_preset_is_answered_with_the_known_ones():

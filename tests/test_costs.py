@@ -203,7 +203,7 @@ def test_round_trip(tmp_path, name):
 
 
 def test_costs_of_the_package_load_by_name(tmp_path, monkeypatch):
-    sizes = {"lidar_mlp_8": 41, "min_distance_8": 13}
+    sizes = {"lidar_mlp": 41, "lidar_mlp_8": 41, "min_distance_8": 13}
     assert set(list_costs()) == set(sizes)
     for name in list_costs():
         theta = load_cost(name)
@@ -211,7 +211,8 @@ def test_costs_of_the_package_load_by_name(tmp_path, monkeypatch):
         assert bool(jnp.isfinite(theta).all())
         card = cost_card(name)
         assert {"found", "budget", "validation", "fails"} <= set(card)
-        assert card["environment"] == "Goal-Hazard8-Point"
+        world = "Goal-Hazard8-Point" if name.endswith("_8") else "Goal-Hazard-Point"
+        assert card["environment"] == world
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match="a cost of the package"):
         save_cost("lidar_mlp_8", np.ones(41), {})

@@ -9,25 +9,28 @@ import pytest
 
 from autocost_jax import make_env, preset
 from autocost_jax.config import SearchConfig
-from autocost_jax.costs import intrinsic_cost, intrinsic_logit
+from autocost_jax.costs import intrinsic_cost
 from autocost_jax.es import (
-    LOUD_COSTS,
-    QUIET_COST,
-    QUIET_PLACES,
     Fitness,
     best,
     failed_stage,
-    graded_start,
-    keep_level,
-    monotone_start,
     mutate,
+    pool,
     rank,
     select,
+    top,
     truncation_es,
 )
-from autocost_jax.evolution import _strategy
 from autocost_jax.population import jit_bundle
 from autocost_jax.rollout import typical_lidars
+from autocost_jax.stages import make_strategy
+from autocost_jax.starts import (
+    LOUD_COSTS,
+    LOUD_PLACE,
+    QUIET_COST,
+    QUIET_PLACES,
+    graded_start,
+)
 
 SIGMAS = 5.0  # of the estimate: a fixed key passes or fails for good
 SMALL = SearchConfig(population_size=6, num_elites=2, num_stages=3)
@@ -115,51 +118,66 @@ def test_equal_costs_fall_to_the_higher_return():
     assert rank(fitness).tolist() == [1, 2, 0]
 
 
+def with_floor(fitness, floor):
+    return fitness.replace(floor=jnp.full_like(fitness.cost, floor))
+
+
 def test_below_the_floor_only_the_return_counts():
     """Behind all others, however safe, but before what is not finite."""
     costs = [0.0, 3.0, 1.0, 0.5, np.nan, 1.0]
     returns = [-2.0, 4.0, 2.0, 1.9, 9.0, 5.0]
     fitness = make_fitness(costs, returns)
-    assert rank(fitness, return_floor=2.0).tolist() == [5, 2, 1, 3, 0, 4]
-    assert selected(fitness, return_floor=2.0) == [5, 2]
-    assert rank(fitness).tolist() == rank(fitness, return_floor=-3.0).tolist()
+    assert rank(with_floor(fitness, 2.0)).tolist() == [5, 2, 1, 3, 0, 4]
+    assert selected(with_floor(fitness, 2.0)) == [5, 2]
+    assert rank(fitness).tolist() == rank(with_floor(fitness, -3.0)).tolist()
 
 
 def test_a_floor_that_nobody_reaches_asks_for_return():
     fitness = make_fitness([0.0, 3.0, 1.0], [0.0, 1.0, -1.0])
-    assert rank(fitness, return_floor=10.0).tolist() == [1, 0, 2]
+    assert rank(with_floor(fitness, 10.0)).tolist() == [1, 0, 2]
 
 
 def test_best_with_a_floor_is_useful(key):
-    es = truncation_es(dataclasses.replace(SMALL, return_floor=1.0))
+    es = truncation_es(SMALL)
     candidates = es.ask(key, es.init())
     size = len(candidates)
     fitness = make_fitness([0.0, *[2.0] * (size - 1)], [0.0, *[3.0] * (size - 1)])
     state = es.tell(key, es.init(), candidates, fitness)
     assert int(best(state, size).index) == 0
-    assert int(best(state, size, return_floor=1.0).index) == 1
+    state = es.tell(key, es.init(), candidates, with_floor(fitness, 1.0))
+    assert int(best(state, size).index) == 1
     np.testing.assert_array_equal(state.elites[0], candidates[1])
 
 
-def lidars_of(distance, count=64):
-    """Readings of one object at a distance, in directions all around."""
-    bins = jax.random.uniform(jax.random.key(5), (count, 8))
-    nearest = jax.nn.one_hot(jnp.arange(count) % 8, 8)
-    return 0.1 * bins + nearest * jnp.exp(-distance)
+# Pooled scores ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("network", "size"), [("dense", 41), ("nearest", 13)])
-def test_a_monotone_start_never_falls_as_something_comes_nearer(key, network, size):
-    places = lidars_of(1.0)
-    theta = monotone_start(key, 50, 5.0, places, network)
-    assert theta.shape == (50, size)
-    near = jax.vmap(lambda theta: intrinsic_cost(theta, lidars_of(0.2)))(theta)
-    far = jax.vmap(lambda theta: intrinsic_cost(theta, lidars_of(0.9)))(theta)
-    assert bool((near >= far).all())
-    assert float(jnp.mean(near[:, :8])) > 3 * float(jnp.mean(far[:, :8]))
-    typical = jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta)
-    middle = np.median(np.asarray(typical), axis=1)
-    np.testing.assert_allclose(middle, QUIET_COST, rtol=0.05)
+def test_pooling_is_the_mean_over_all_trainings_of_a_candidate():
+    candidates = {"w": jnp.array([[1.0], [2.0], [1.0], [3.0], [2.0]])}
+    fitness = make_fitness([5.0, 1.0, 0.0, 7.0, np.inf], [1.0, 2.0, 3.0, 4.0, -np.inf])
+    pooled = pool(candidates, fitness)
+    assert pooled.cost.tolist() == [2.5, np.inf, 2.5, 7.0, np.inf]
+    assert pooled.ep_return.tolist() == [2.0, -np.inf, 2.0, 4.0, -np.inf]
+
+
+def test_a_lucky_retraining_is_no_zero_violation(key):
+    """The same theta cost 5 and then 0: it is at 2.5, and another one is best."""
+    es = truncation_es(dataclasses.replace(SMALL, pool_scores=True, num_elites=1))
+    state, size = es.init(), SMALL.population_size
+    costs = ([5.0, *[9.0] * (size - 1)], [0.0, 2.0, *[9.0] * (size - 2)])
+    for stage, cost in enumerate(costs):
+        candidates = es.ask(jax.random.fold_in(key, stage), state)
+        state = es.tell(key, state, candidates, make_fitness(cost, [0.0] * size))
+    pick = best(state, size, pool_scores=True)
+    assert place(pick) == (1, 1, False)
+    np.testing.assert_array_equal(state.elites[0], candidates[1])
+    assert place(best(state, size)) == (1, 0, True)  # unpooled, the paper's archive
+    _, order = top(state, 3, pool_scores=True)
+    assert len({state.archive[i].tobytes() for i in np.asarray(order)}) == 3
+    assert order.tolist()[:2] == [size + 1, 0]
+
+
+# Where a search begins -------------------------------------------------------
 
 
 @pytest.mark.parametrize("network", ["dense", "nearest"])
@@ -172,7 +190,7 @@ def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network):
     assert quiet.max() < QUIET_PLACES[1] + 1
     np.testing.assert_allclose(quiet.mean(), np.mean(QUIET_PLACES), atol=SIGMAS * 0.9)
     low, high = LOUD_COSTS
-    loud = np.percentile(costs, 70, axis=1)
+    loud = np.percentile(costs, LOUD_PLACE, axis=1)
     inside = (loud > 0.9 * low) & (loud < 1.1 * high)
     assert inside.mean() > 0.9  # the others' units are all but off
     share = np.log(loud[inside] / low) / np.log(high / low)
@@ -181,64 +199,67 @@ def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network):
     assert bool((nearer >= costs).all())
 
 
-def test_children_stay_as_loud_as_their_parents(key):
-    places, std = lidars_of(1.0), 0.5
-    keys = jax.random.split(key, 3)
-    elites = monotone_start(keys[0], 3, 8.0, places)
-    elites = elites.at[:, -1].add(jnp.array([-2.0, 0.0, 2.0]))
-    children = mutate(keys[1], elites, 300)
-
-    def levels(theta):
-        logits = jax.vmap(lambda theta: intrinsic_logit(theta, places))(theta)
-        return np.median(np.asarray(logits), axis=1)
-
-    kept = keep_level(keys[2], elites, children, places, std)
-    np.testing.assert_array_equal(kept[:, :-1], children[:, :-1])
-    parents = np.tile(levels(elites), 100)
-    assert np.std(levels(children) - parents) > 3  # what the paper's mutations do
-    shift = (levels(kept) - parents).reshape(100, 3)
-    assert np.abs(shift.mean(0)).max() < SIGMAS * std / 10
-    np.testing.assert_allclose(shift.std(), std, rtol=0.15)
+def test_a_graded_start_keeps_to_other_ranges(key):
+    places = typical_lidars(make_env("Goal-Hazard-Point"), jax.random.key(1), 256)
+    ranges = {"quiet_places": (60.0, 70.0), "loud_costs": (0.4, 0.5)}
+    theta = graded_start(key, 50, 8.0, places, **ranges)
+    costs = np.asarray(jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta))
+    quiet = 100 * (costs < QUIET_COST).mean(1)
+    assert (quiet > 59).all()
+    assert (quiet < 71).all()
+    assert np.median(np.percentile(costs, LOUD_PLACE, axis=1)) > 0.35
 
 
-def test_children_are_adjusted_and_elites_are_not(key):
-    es = truncation_es(SMALL, adjust=lambda key, elites, children: 0 * children)
-    first = es.ask(key, es.init())
-    fitness = make_fitness(range(len(first)), [1.0] * len(first))
-    later = es.ask(key, es.tell(key, es.init(), first, fitness))
-    elites = SMALL.num_elites
-    np.testing.assert_array_equal(later[:elites], first[:elites])
-    assert not later[elites:].any()
-
-
-@pytest.mark.parametrize("start", ["monotone", "graded"])
-@pytest.mark.parametrize("network", ["dense", "nearest"])
-def test_a_search_hands_its_world_to_its_options(key, start, network):
+def test_a_search_hands_its_world_to_its_start(key):
     config = preset("smoke")
-    env = dataclasses.replace(config.train.env, physics="closed_form")
-    train = dataclasses.replace(config.train, env=env)
-    sizes = {"population_size": 12, "num_elites": 2, "num_stages": 2, "init_std": 8.0}
-    options = {"start": start, "keep_level": True, "mutation_std": 0.01}
-    options |= {"network": network}
-    es = _strategy(dataclasses.replace(config, train=train, **sizes, **options))
+    sizes = {"population_size": 12, "num_elites": 2, "num_finalists": 0}
+    es = make_strategy(dataclasses.replace(config, start="graded", **sizes))
     first = es.ask(key, es.init())
-    fitness = make_fitness(range(12), [1.0] * 12)
-    later = es.ask(key, es.tell(key, es.init(), first, fitness))
-    places = typical_lidars(make_env(env), jax.random.key(0))
+    places = typical_lidars(make_env(config.train.env), jax.random.key(0))
     costs = jax.vmap(lambda theta: intrinsic_cost(theta, places))
     quiet = 100 * np.mean(np.asarray(costs(first)) < QUIET_COST, axis=1)
-    low, high = (50, 50) if start == "monotone" else QUIET_PLACES
-    assert quiet.min() > low - 1
-    assert quiet.max() < high + 1
-    first, later = (
-        np.log(np.median(np.asarray(costs(theta)), axis=1)) for theta in (first, later)
+    assert quiet.min() > QUIET_PLACES[0] - 1
+    assert quiet.max() < QUIET_PLACES[1] + 1
+
+
+# A user's own functions ------------------------------------------------------
+
+
+def test_candidates_may_be_any_pytree(key):
+    """Start, mutation and ranking replaced; all of ask, tell and best."""
+    config = dataclasses.replace(SMALL, pool_scores=True)
+
+    def start(key):
+        w = jax.random.normal(key, (config.population_size, 2, 3))
+        return {"w": w, "n": jnp.arange(config.population_size)}
+
+    def vary(key, elites, num):
+        del key
+        return jax.tree.map(lambda x: jnp.repeat(x[:1], num, axis=0) * 10, elites)
+
+    es = jit_bundle(
+        truncation_es(
+            config,
+            init=start,
+            mutate=vary,
+            rank=lambda fitness: jnp.argsort(-fitness.cost),  # the worst first
+        )
     )
-    np.testing.assert_allclose(later, np.tile(first[:2], 6), atol=0.2)
+    state = es.init()
+    first = es.ask(key, state)
+    fitness = make_fitness(range(6), [0.0] * 6)
+    state = es.tell(key, state, first, fitness)
+    assert state.elites["n"].tolist() == [5, 4]
+    later = es.ask(key, state)
+    assert later["n"].tolist() == [5, 4, 50, 50, 50, 50]
+    np.testing.assert_array_equal(later["w"][2], 10 * first["w"][5])
+    pick = best(state, config.population_size, pool_scores=True)
+    assert int(pick.candidate["n"]) == 0
 
 
 def test_another_start_replaces_the_first_candidates_alone(key):
     start = jnp.full((SMALL.population_size, 41), 7.0)
-    es = truncation_es(SMALL, lambda key: start)
+    es = truncation_es(SMALL, init=lambda key: start)
     first = es.ask(key, es.init())
     np.testing.assert_array_equal(first, start)
     fitness = make_fitness([1.0] * len(first), [1.0] * len(first))

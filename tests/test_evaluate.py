@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from autocost_jax.evaluate import evaluate, run_episodes, score
-from toys import NUM_STEPS, LinearState, linear_agent, make_toy_env
+from toys import ARENA, NUM_STEPS, LinearState, linear_agent, make_toy_env
 
 NUM_EPISODES = 6
 ROUNDING = 1e-5  # 16 float32 terms summed in another order
@@ -25,22 +25,24 @@ def state(env):
 
 
 def by_hand(env, state, key, deterministic):
-    """Return, cost and path of each episode, one world and one step at a time."""
+    """Return, cost, path and share of steps outside of each episode, step by step."""
     agent = linear_agent(env)
     key_reset, key_act = jax.random.split(key)
     worlds = jax.vmap(env.reset)(jax.random.split(key_reset, NUM_EPISODES))
     step = jax.jit(env.step)
     act = jax.jit(lambda obs, key: agent.policy(state, obs, key, deterministic))
     episodes = [jax.tree.map(lambda x, i=i: x[i], worlds) for i in range(NUM_EPISODES)]
-    sums = np.zeros((3, NUM_EPISODES))
+    sums = np.zeros((4, NUM_EPISODES))
     for t in range(NUM_STEPS):
         obs = jnp.stack([world.obs for world in episodes])
         action = act(obs, jax.random.fold_in(key_act, t))
         for i in range(NUM_EPISODES):
             before = np.asarray(episodes[i].layout.robot_xy)
             episodes[i] = step(episodes[i], action[i])
-            path = np.linalg.norm(np.asarray(episodes[i].layout.robot_xy) - before)
-            sums[:, i] += episodes[i].reward, episodes[i].cost, path
+            after = np.asarray(episodes[i].layout.robot_xy)
+            path = np.linalg.norm(after - before)
+            outside = (np.abs(after) > ARENA).any() / NUM_STEPS
+            sums[:, i] += episodes[i].reward, episodes[i].cost, path, outside
     return sums
 
 
@@ -50,10 +52,11 @@ def test_sums_against_a_loop(env, state, key, deterministic):
     result = jax.jit(
         lambda s, k: evaluate(env, agent, s, k, NUM_EPISODES, deterministic)
     )(state, key)
-    ep_return, ep_cost, path = by_hand(env, state, key, deterministic)
+    ep_return, ep_cost, path, outside = by_hand(env, state, key, deterministic)
     np.testing.assert_allclose(result.ep_return, ep_return, atol=ROUNDING)
     np.testing.assert_allclose(result.ep_cost, ep_cost, atol=ROUNDING)
     np.testing.assert_allclose(result.distance_travelled, path, atol=ROUNDING)
+    np.testing.assert_allclose(result.outside_share, outside, atol=ROUNDING)
     assert result.valid.tolist() == [1.0] * NUM_EPISODES
     assert len(np.unique(result.ep_return)) == NUM_EPISODES
     assert float(result.violation_rate) == pytest.approx((ep_cost > 0).mean())

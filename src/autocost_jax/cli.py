@@ -1,4 +1,4 @@
-"""`autocost`: train, evaluate, render, report, envs, bench, info."""
+"""`autocost`: demo, train, evaluate, render, report, envs, bench, info."""
 
 import json
 import sys
@@ -22,6 +22,7 @@ from autocost_jax.commandline import (
 HELP = """usage: autocost COMMAND [flags]
 
 commands:
+  demo      two shipped policies side by side in one page; no training
   train     train agents with any cost of the bank, several seeds at once
   evaluate  score the saved policies of a run over fresh episodes
   render    replay an episode of a policy: an HTML page, and a film if asked for
@@ -39,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command line; `argv` defaults to the program's."""
     argv = list(sys.argv[1:] if argv is None else argv)
     quiet()
-    commands = {"train": _train, "evaluate": _evaluate, "render": _render}
+    commands = {"demo": _demo, "train": _train, "evaluate": _evaluate, "render": _render}
     commands |= {"report": _report, "envs": _envs, "bench": _bench, "info": _info}
     if not argv or argv[0] in ("-h", "--help"):
         print(HELP, end="")
@@ -49,6 +50,30 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.stderr.write(f"autocost: unknown command {argv[0]!r}; commands: {known}\n")
         raise SystemExit(BAD_INPUT)
     guarded(lambda: commands[argv[0]](argv[1:]), f"autocost {argv[0]}")
+
+
+def _demo(argv: list[str]) -> None:
+    @dataclass(frozen=True)
+    class Options:
+        """Shipped policies side by side: the extrinsic cost alone and a found cost.
+
+        Attributes:
+          out: folder of the page.
+          seed: of the layouts and actions.
+          compile_cache: keep compiled programs in the user's cache directory.
+        """
+
+        out: Path = Path("runs/demo")
+        seed: int = 0
+        compile_cache: bool = True
+
+    options = parse(Options, argv, "autocost demo")
+    use_compile_cache(options.compile_cache)
+    from autocost_jax.demo import write_demo
+
+    demo = write_demo(options.out, options.seed)
+    for line in [*demo.lines, f"open {demo.page}"]:
+        print(line)
 
 
 def _train(argv: list[str]) -> None:

@@ -23,6 +23,7 @@ from autocost_jax.env_config import EnvConfig
 Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
 Start = Literal["normal", "graded"]
+Judge = Literal["cost", "violations"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 CostNetwork = Literal["dense", "nearest"]
 THETA_SIZES: dict[CostNetwork, int] = {"dense": 41, "nearest": 13}
@@ -37,9 +38,7 @@ class AgentConfig:
     step) and `value_passes` x `value_minibatches` critic steps. `critic_precision` is
     that of the hidden layers in the critics' own steps, nowhere else: tensorfloat32
     (of a GPU; float32 elsewhere) or bfloat16 for speed. `normalize_obs` (ours) brings
-    every observation to mean 0 and deviation 1 over what the agent has seen, and
-    `multiplier_max` (ours) bounds PPO-Lagrangian's multiplier, which at a limit of 0
-    otherwise never stops growing.
+    every observation to mean 0 and deviation 1 over what the agent has seen.
     """
 
     hidden_sizes: tuple[int, ...] = (256, 256)
@@ -61,7 +60,6 @@ class AgentConfig:
     critic_precision: Precision = "float32"
     multiplier_init: float = 1.0
     multiplier_lr: float = 0.05
-    multiplier_max: float | None = None
     cg_iterations: int = 10
     cg_damping: float = 0.1
     backtrack_steps: int = 10
@@ -110,8 +108,6 @@ class AgentConfig:
             "multiplier_lr",
             "cg_damping",
         )
-        if self.multiplier_max is not None:
-            require_positive(self, "multiplier_max")
         ratio = self.backtrack_ratio
         require(0 < ratio < 1, "backtrack_ratio", "in (0, 1)", ratio)
 
@@ -185,8 +181,9 @@ class SearchConfig:
 
     Options of ours beside the paper's rule, all off by default. `start="graded"` draws
     first costs that rise as anything comes nearer, with a set reach and loudness, see
-    `starts.graded_start`. Each candidate is trained with `seeds_per_candidate` seeds and
-    judged by their mean. With `references` each algorithm trains two more slots a seed
+    `starts.graded_start`. Each candidate is trained with `seeds_per_candidate` seeds
+    and judged by their mean: that of the extrinsic cost, or with `judge_by="violations"`
+    that of the share of violating episodes, which training noise moves less. With `references` each algorithm trains two more slots a seed
     in every stage, the extrinsic cost alone and with a margin of 3x; `return_share`
     asks that a candidate returns that share of what the first of them does, and ranks
     those that do not behind all others. With `pool_scores` elites are
@@ -215,6 +212,7 @@ class SearchConfig:
     network: CostNetwork = "dense"
     seeds_per_candidate: int = 1
     references: bool = False
+    judge_by: Judge = "cost"
     return_share: float = 0.0
     pool_scores: bool = False
     num_finalists: int = 0
@@ -265,6 +263,7 @@ class SearchConfig:
         literals = {
             "selection": Selection,
             "start": Start,
+            "judge_by": Judge,
             "network": CostNetwork,
         }
         for name, kind in literals.items():
@@ -357,8 +356,8 @@ _LAPTOP_AGENT = AgentConfig(
     value_minibatches=8,
 )
 
-# What `experiments/fitness.py` and `learners.py` support: a start among costs of which
-# some are useful, mild mutations, long stages rather than more seeds, a price in return.
+# What `experiments/fitness.py` and `learners.py` support: a start among costs of
+# which some are useful, mild mutations, few and long stages, a price in return.
 _GUIDED: dict[str, Any] = {
     "start": "graded",
     "init_std": 8.0,
@@ -366,7 +365,8 @@ _GUIDED: dict[str, Any] = {
     "mutation_low": 0.8,
     "mutation_high": 1.25,
     "references": True,
-    "return_share": 0.3,
+    "judge_by": "violations",
+    "return_share": 0.4,
     "pool_scores": True,
 }
 
@@ -376,15 +376,15 @@ PRESETS: dict[str, SearchConfig] = {
             env=EnvConfig(physics="closed_form"),
             agent=_LAPTOP_AGENT,
             num_worlds=4,
-            num_epochs=80,
+            num_epochs=72,
             chunk_epochs=2,
         ),
         population_size=10,
         num_elites=2,
         num_stages=2,
-        fitness_epochs=20,
+        fitness_epochs=18,
         num_finalists=2,
-        final_epochs=104,
+        final_epochs=128,
         **_GUIDED,
     ),
     "search": SearchConfig(
@@ -406,7 +406,7 @@ PRESETS: dict[str, SearchConfig] = {
     "paper": SearchConfig(train=TrainConfig(chunk_epochs=3)),
     "smoke": SearchConfig(
         train=TrainConfig(
-            env=EnvConfig(num_steps=50),
+            env=EnvConfig(num_steps=50, physics="closed_form"),
             agent=dataclasses.replace(
                 _LAPTOP_AGENT,
                 hidden_sizes=(16, 16),

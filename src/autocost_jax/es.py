@@ -24,7 +24,8 @@ class Fitness(struct.PyTreeNode):
     """How good the candidates were; lower cost first, then higher return.
 
     Attributes:
-      cost: [P] mean extrinsic cost per episode; +inf for a broken candidate.
+      cost: [P] what is to be low, such as the mean extrinsic cost per episode; +inf for
+        a broken candidate.
       ep_return: [P] return per episode; -inf for a broken candidate.
       floor: [P] return below which a candidate is of no use; None: there is no such
         demand. See `rank`.
@@ -104,8 +105,8 @@ def rank(fitness: Fitness, zero_tolerance: float = 0.0) -> jax.Array:
 
     Where the fitness has floors (ours), candidates that return less than theirs come
     after all others and are compared by return alone (the feasibility rule of Deb 2000,
-    "An efficient constraint handling method for genetic algorithms"). Without them costs
-    that make agents flee or stand still win, as they are the first to be safe.
+    "An efficient constraint handling method for genetic algorithms"). Without them
+    costs that make agents flee or stand still win, as they are the first to be safe.
     """
     ok = fitness.finite
     cost = jnp.where(fitness.cost <= zero_tolerance, 0.0, fitness.cost)

@@ -23,7 +23,7 @@ BEST = "best"
 # episodes and at least this share of its return, for every algorithm.
 VIOLATIONS_LEFT, RETURN_KEPT = 0.25, 0.3
 JUDGED = 0.05  # violations of the extrinsic cost below which nothing can be judged
-FLEES = 0.2  # share of the steps outside the arena that is called fleeing
+FLEES = 0.5  # share of the steps outside the arena that is called fleeing
 
 
 class Scores(NamedTuple):
@@ -107,7 +107,7 @@ def _mean(values: Any, valid: Any) -> np.ndarray:
 def pick(config: SearchConfig, scores: Scores) -> int:
     """The best finalist: fewest violating episodes among those that are of use.
 
-    Of use is what keeps `return_share` of the extrinsic cost's return with each
+    Of use is what keeps `RETURN_KEPT` of the extrinsic cost's return with each
     algorithm; without any such finalist the one that comes closest to it is picked.
     """
     references = reference_places(config)
@@ -115,8 +115,8 @@ def pick(config: SearchConfig, scores: Scores) -> int:
     ep_return = scores.ep_return.mean(2)
     violations = scores.violation_rate.mean(2)[:, :count].mean(0)
     missing = np.zeros(count)
-    if config.return_share and references:
-        floor = config.return_share * ep_return[:, count]
+    if references:
+        floor = RETURN_KEPT * ep_return[:, count]
         missing = np.maximum(floor[:, None] - ep_return[:, :count], 0).max(0)
     missing = np.nan_to_num(missing, nan=np.inf)
     violations = np.where(missing > 0, 0.0, np.nan_to_num(violations, nan=np.inf))

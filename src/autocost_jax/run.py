@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax import cluster
@@ -18,6 +19,7 @@ from autocost_jax.agents.base import Actor, actor
 from autocost_jax.arrays import flatten
 from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import make_env
+from autocost_jax.es import Fitness
 from autocost_jax.evolution import (
     Progress,
     Searcher,
@@ -57,6 +59,9 @@ from autocost_jax.store import (
     open_run,
 )
 from autocost_jax.train import slots_at_once
+
+
+CHECKPOINT_SECONDS = 15.0  # at least, between two checkpoints within a stage
 
 
 def estimate_memory(config: SearchConfig, num_devices: int) -> int:
@@ -266,6 +271,7 @@ def _train(
 ) -> SearchState:
     config = run.config
     chunk = config.train.chunk_epochs
+    saved_at = -np.inf  # the first chunk is kept, whatever comes
     display.start_clock()
     for after, progress in evolve(config, state=state, searcher=searcher):
         state = after
@@ -284,9 +290,13 @@ def _train(
             _write_stage(run, searcher, state, progress, progress.result)
             for line in stage_lines(config, progress.stage, progress.result):
                 display.say(line)
-        position = {"stage": int(state.stage), "epoch": int(state.epoch)}
-        saved = state.replace(learners=searcher.population.fetch(state.learners))
-        run.save_checkpoint(saved, first + chunk, position)
+        is_due = time.monotonic() - saved_at >= CHECKPOINT_SECONDS
+        is_due |= int(state.stage) > progress.stage  # the end of a stage
+        if is_due or jax.process_count() > 1:  # clocks differ, and all must take part
+            position = {"stage": int(state.stage), "epoch": int(state.epoch)}
+            saved = state.replace(learners=searcher.population.fetch(state.learners))
+            run.save_checkpoint(saved, first + chunk, position)
+            saved_at = time.monotonic()
     return state
 
 
@@ -303,7 +313,10 @@ def _write_stage(
     scores |= {f"references/{key}": x for key, x in result.references.items()}
     arrays = {
         "theta": result.candidates,
-        "cost": result.fitness.cost,
+        "cost": jnp.where(
+            result.frozen.any(0), jnp.inf, result.scores["ep_cost"].mean(0)
+        ),
+        "judged": result.fitness.cost,
         "ep_return": result.fitness.ep_return,
         "floor": result.fitness.floor
         if result.fitness.floor is not None
@@ -341,7 +354,7 @@ def _finish(
 
     config = run.config
     best_of(config, state.es)  # refuses a failed search
-    actors, num_seeds, places = _contenders(run, searcher, state)
+    actors, num_seeds, places, fitness = _contenders(run, searcher, state)
     key = jax.random.fold_in(searcher.root, EVALUATION)
     what = f"evaluating over {num_episodes} fresh episodes an agent"
     with display.working(what) as tell:
@@ -366,8 +379,9 @@ def _finish(
         "environment": config.train.env.name,
         "stage": stage,
         "index": index,
-        "search_cost": float(state.es.archive_fitness.cost[row]),
-        "search_return": float(state.es.archive_fitness.ep_return[row]),
+        "judged_by": config.judge_by,
+        "search_score": float(fitness.cost[row]),
+        "search_return": float(fitness.ep_return[row]),
         "env_steps": config.env_steps,
         "seed": config.seed,
         "evaluation": {r["algorithm"]: r for r in rows if r["cost"] == BEST},
@@ -388,15 +402,18 @@ def _finish(
 
 def _contenders(
     run: RunDir, searcher: Searcher, state: SearchState
-) -> tuple[list[Actor], int, np.ndarray]:
-    """Whose episodes decide: for each algorithm actors [C x S, ...]; S; and the places
-    of the first costs in the archive.
+) -> tuple[list[Actor], int, np.ndarray, Fitness]:
+    """Whose episodes decide, and where their costs stand in the archive.
 
     Without a stage of finalists it is the agent of the best candidate that its stage
     left, one seed.
+
+    Returns:
+      For each algorithm actors [C x S, ...]; S; places of the candidates among the C;
+      and what the archive was judged by.
     """
     config = run.config
-    _, order = es_lib.top(
+    fitness, order = es_lib.top(
         state.es,
         max(1, config.num_finalists),
         config.zero_tolerance,
@@ -404,11 +421,11 @@ def _contenders(
     )
     if config.num_finalists:
         learners = searcher.population.fetch(state.learners)
-        return *finalist_actors(config, learners), np.asarray(order)
+        return *finalist_actors(config, learners), np.asarray(order), fitness
     stage = int(order[0]) // config.population_size
     files = [
         run.path / "policies" / f"{policy_name(stage, name)}.npz"
         for name in config.algorithms
     ]
     loaded = (load_policies(config.train, [file])[1] for file in files)
-    return [actor(state) for state in loaded], 1, np.asarray(order)
+    return [actor(state) for state in loaded], 1, np.asarray(order), fitness

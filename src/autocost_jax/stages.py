@@ -186,7 +186,8 @@ def stage_result(
 ) -> StageResult:
     """Fitness and scores of a finished stage; a frozen agent costs +inf.
 
-    The cost and the return of a candidate are the means over its agents. With a
+    The cost (or share of violating episodes, see `SearchConfig.judge_by`) and the return
+    of a candidate are the means over its agents. With a
     `return_share` the floor is that share of what the extrinsic cost alone leaves.
 
     Args:
@@ -212,8 +213,9 @@ def stage_result(
     if config.return_share > 0:
         price = config.return_share * jnp.mean(references["ep_return"][:, 0])
         floor = jnp.broadcast_to(price, ep_return.shape)
+    judged = "ep_cost" if config.judge_by == "cost" else "violating_worlds"
     fitness = Fitness(
-        cost=jnp.where(broken, jnp.inf, jnp.mean(scores["ep_cost"], axis=0)),
+        cost=jnp.where(broken, jnp.inf, jnp.mean(scores[judged], axis=0)),
         ep_return=jnp.where(broken, -jnp.inf, ep_return),
         floor=floor,
     )

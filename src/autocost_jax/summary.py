@@ -23,7 +23,7 @@ from autocost_jax.report import (
 from autocost_jax.report_assets.data import COST_NAMES, NAMES
 from autocost_jax.report_assets.replay import Replay
 from autocost_jax.scene import Recording, make_replay
-from autocost_jax.stages import REFERENCES
+from autocost_jax.stages import REFERENCES, deal
 from autocost_jax.store import list_stages, read_config, read_metrics
 
 
@@ -165,7 +165,8 @@ def _best(
     number, index = card.get("stage", number), card.get("index", index)
     stage = stages[number]
     is_zero = bool(stage.zero_violation[index])
-    shown = ("environment", "search_cost", "search_return", "env_steps", "seed")
+    shown = ("environment", "judged_by", "search_score", "search_return")
+    shown += ("env_steps", "seed")
     return BestCandidate(
         stage=number,
         index=index,
@@ -176,13 +177,17 @@ def _best(
 
 
 def _curves(config: SearchConfig, rows: list[dict[str, Any]]) -> list[Curve]:
+    """Curves of the candidates, and of the finalists as one stage more."""
     curves = []
     for number in sorted({row["stage"] for row in rows}):
         chosen = [row for row in rows if row["stage"] == number]
+        dealt = deal(config, is_final=number == config.num_stages)
+        count = dealt.num_costs - config.num_references
         for name in config.algorithms:
 
-            def column(key: str, name=name, chosen=chosen) -> np.ndarray:
-                return np.asarray([row[f"{name}/{key}"] for row in chosen], float)
+            def column(key: str, name=name, chosen=chosen, dealt=dealt, count=count):
+                values = np.asarray([row[f"{name}/{key}"] for row in chosen], float)
+                return dealt.table(values)[:, :count].mean(-1)
 
             curves.append(
                 Curve(

@@ -52,7 +52,7 @@ def update_multiplier(
     """One Adam step on p, whose softplus is the multiplier: dp = -(J_c - d).
 
     Args:
-      config: learning rate and bound.
+      config: learning rate.
       multiplier: [] p.
       opt_state: Adam's state.
       j_c: [] mean episode cost of this epoch.
@@ -64,14 +64,7 @@ def update_multiplier(
     updates, opt_state = optax.adam(config.multiplier_lr).update(
         -(j_c - limit), opt_state
     )
-    multiplier: Any = optax.apply_updates(multiplier, updates)
-    if config.multiplier_max is not None:
-        multiplier = jnp.minimum(multiplier, _inverse_softplus(config.multiplier_max))
-    return multiplier, opt_state
-
-
-def _inverse_softplus(value: float) -> float:
-    return float(np.log(np.expm1(value)))
+    return optax.apply_updates(multiplier, updates), opt_state  # pyright: ignore
 
 
 def clipped_objective(
@@ -248,7 +241,8 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
     def init(key: Key) -> AgentState:
         policy, critic = networks.init(key)
         dtype = jnp.result_type(float)
-        p = jnp.asarray(_inverse_softplus(config.multiplier_init), dtype)
+        # softplus(p) = multiplier_init
+        p = jnp.asarray(np.log(np.expm1(config.multiplier_init)), dtype)
         return AgentState(
             policy=policy,
             critic=critic,

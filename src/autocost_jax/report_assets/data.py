@@ -24,7 +24,7 @@ class StageRecord:
 
     Attributes:
       theta: [P, D] the candidates' networks.
-      cost: [P] extrinsic cost of an episode, by `judge_by`; +inf: frozen.
+      cost: [P] extrinsic cost of an episode, mean over the agents; +inf: frozen.
       ep_return: [P] return of an episode, likewise; -inf: frozen.
       algorithm_cost: [A, P] the same cost of each algorithm's agent.
       algorithm_return: [A, P] the same return of each algorithm's agent.

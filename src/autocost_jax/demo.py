@@ -1,0 +1,88 @@
+"""`autocost demo`: two shipped policies side by side, without any training."""
+
+import dataclasses
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from autocost_jax.agents.base import actor
+from autocost_jax.arrays import load_arrays, unflatten
+from autocost_jax.config import TrainConfig, preset
+from autocost_jax.costs import load_cost
+from autocost_jax.env_config import env_config
+from autocost_jax.envs.env import make_env
+from autocost_jax.policies import policy_states
+from autocost_jax.population import make_agents, make_evaluator
+from autocost_jax.report import network_cost, write_comparison
+from autocost_jax.scene import first_recording, make_replay, watch_first
+
+WORLD = "Goal-Hazard-Point"
+FOUND = "lidar_mlp"  # the best shipped cost of this world
+LABELS = {"extrinsic": "extrinsic cost alone", FOUND: f"with the cost {FOUND}"}
+
+
+class Demo(NamedTuple):
+    """What a demo shows.
+
+    Attributes:
+      page: the file to open.
+      lines: scores for people.
+    """
+
+    page: Path
+    lines: list[str]
+
+
+def demo_train() -> TrainConfig:
+    """The world and networks that the shipped policies were trained with."""
+    train = preset("laptop").train
+    env = dataclasses.replace(env_config(WORLD), physics="closed_form")
+    return dataclasses.replace(train, env=env)
+
+
+def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
+    """Replay CPO's agents under the extrinsic cost alone and under a found cost.
+
+    Args:
+      out: folder of the page.
+      seed: of the layouts, which both agents meet, and of the actions.
+      num_episodes: that the scores are of; the first is shown.
+    """
+    train = demo_train()
+    env = make_env(train.env)
+    (agent,) = make_agents(("cpo",), train, env)
+    like = actor(agent.init(jax.random.key(0)))
+    folder = resources.files("autocost_jax") / "found" / "policies"
+    loaded = [
+        unflatten(load_arrays(Path(str(folder / f"{name}_cpo.npz")), None), like)
+        for name in LABELS
+    ]
+    acting, states = policy_states(
+        train, jax.tree.map(lambda *leaves: np.stack(leaves), *loaded)
+    )
+    evaluate = make_evaluator(env, acting, num_episodes, watch=watch_first)
+    result, episodes = evaluate(states, jax.random.key(seed))
+    theta = np.asarray(load_cost(FOUND))
+    replays, lines = [], []
+    for i, (name, label) in enumerate(LABELS.items()):
+        recording = first_recording(jax.tree.map(lambda x, i=i: x[i], episodes))
+        intrinsic = None
+        if name == FOUND:
+            intrinsic = network_cost(theta, recording.constraint_lidar)
+        title = f"CPO, {label}"
+        replay = make_replay(train.env, recording, intrinsic=intrinsic, label=title)
+        replays.append(replay)
+        lines.append(
+            f"{title}: return {float(result.ep_return[i].mean()):.1f}, "
+            f"{float(result.violation_rate[i]):.0%} of {num_episodes} episodes violate"
+        )
+    text = (
+        "The same world, the same learner, the same number of steps. Both robots drive "
+        "to goals; the discs are hazards, which cost something while one is inside. "
+        f"{lines[0]}. {lines[1]}."
+    )
+    page = write_comparison(replays, f"{WORLD}: two costs", text, out / "index.html")
+    return Demo(page, lines)
