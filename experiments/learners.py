@@ -22,6 +22,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from common import compact, t_interval
 
 from autocost_jax.agents.base import actor
 from autocost_jax.commandline import use_devices
@@ -31,7 +32,6 @@ from autocost_jax.evaluate import evaluate
 from autocost_jax.methods import Method, TableConfig, table_slots
 from autocost_jax.population import make_agents, make_population
 from autocost_jax.store import run_facts
-from common import compact, t_interval
 
 STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
 COSTS = ("extrinsic", "extrinsic+safety_margin_2x", "extrinsic+safety_margin_3x")
@@ -105,7 +105,8 @@ def run_one(name: str, out: Path, smoke: bool) -> None:
     for algorithm, learner in zip(config.algorithms, learners, strict=True):
         group = config.group(algorithm)
         acting = actor(jax.device_get(learner.agent))
-        states = jax.tree.map(lambda x, n=len(group): np.stack([x] * n), template)
+        size = len(group)
+        states = jax.tree.map(lambda x, n=size: np.stack([x] * n), template)
         result = score(states.replace(**acting._asdict()), jax.random.key(99))
         for index, (method, seed) in enumerate(group):
             rows.append(

@@ -1,11 +1,11 @@
-"""The main job, measured: does the search find costs that make agents safe and useful?
+"""The main job, measured: does it find costs that make agents safe and useful?
 
-    python experiments/main_job.py run      # the default job, 3 seeds and their controls
+    python experiments/main_job.py run      # the default job, 3 seeds, their controls
     python experiments/main_job.py collect  # JSON, table, figure
 
-Each search seed is paired with one whose elites are drawn at random under the same keys:
-both meet the same layouts, so that their last stages can be compared. Every run can be
-stopped and started again; finished ones are kept.
+Each search seed is paired with one whose elites are drawn at random under the same
+keys: both meet the same layouts, so that their last stages can be compared. Every run
+can be stopped and started again; finished ones are kept.
 
 Tests, stated before the runs: the mean extrinsic cost of the candidates falls from the
 first stage to the last (95 % bootstrap interval of the fall, over candidates, above 0)
@@ -121,8 +121,8 @@ def best_row(path: Path) -> dict[str, Any]:
 def table(result: dict[str, Any]) -> str:
     """The tables of experiments/results/laptop/main_job.md."""
     lines = [
-        "| search seed | cost of each stage | fall (95 %) | last stage of the control |"
-        " return of each stage | share of the reference's | verdict |",
+        "| search seed | cost of each stage | fall (95 %) | control's last stage "
+        "| return of each stage | share of the reference's | verdict |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in result["searches"]:
@@ -136,14 +136,15 @@ def table(result: dict[str, Any]) -> str:
         )
     lines += [
         "",
-        "| search seed | algorithm | cost | return | violating episodes | extrinsic cost"
-        " per episode | steps outside | seeds x episodes |",
+        "| search seed | algorithm | cost | return | violating episodes | extrinsic "
+        "cost per episode | steps outside | seeds x episodes |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for seed, best in zip(SEEDS, result["best"], strict=True):
         for row in best["rows"]:
+            who = f"| {seed} | {row['algorithm']} | {row['cost']} | "
             lines.append(
-                f"| {seed} | {row['algorithm']} | {row['cost']} | {row['return']:.1f} | "
+                f"{who}{row['return']:.1f} | "
                 f"{row['violation_rate']:.1%} | {row['ep_cost']:.3f} | "
                 f"{row['outside_share']:.0%} | {row['seeds']} x {row['episodes']} |"
             )

@@ -25,6 +25,7 @@ ORDER = (
     "checks",
     "env_config",
     "config",
+    "presets",
     "envs.*",
     "rollout",
     "costs",
@@ -50,16 +51,18 @@ ORDER = (
     "painter",
     "gallery",
     "render",
+    "finish",
     "run",
     "methods",
     "demo",
     "bench",
     "commandline",
     "evolve",
+    "showing",
     "cli",
     "interop.*",
 )
-MAY_PRINT = {"evolve", "cli", "progress", "commandline"}
+MAY_PRINT = {"evolve", "cli", "showing", "progress", "commandline"}
 MAY_JIT = {"population", "bench"}
 # Closures over one agent's configuration, read from top to bottom.
 LONG_FUNCTIONS = {

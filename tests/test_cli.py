@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from autocost_jax.cli import main
-from autocost_jax.config import preset
 from autocost_jax.methods import Method, TableConfig, table_slots
+from autocost_jax.presets import preset
 from autocost_jax.store import open_run, read_metrics
 
 TRAIN = ["train", "--preset", "smoke", "--episodes", "3"]

@@ -5,14 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from autocost_jax.config import (
-    PRESETS,
-    AgentConfig,
-    SearchConfig,
-    TrainConfig,
-    preset,
-)
+from autocost_jax.config import AgentConfig, SearchConfig, TrainConfig
 from autocost_jax.env_config import EnvConfig
+from autocost_jax.presets import PRESETS, preset
 
 NAN, INF = float("nan"), float("inf")
 COUNT = (0, -1, 1.5, NAN, "3", True)
@@ -253,7 +248,7 @@ PROMISED = {
     },
 }
 EPOCHS = {"search": 128, "paper": 333, "smoke": 2}  # laptop: what fits in 8 minutes
-FITNESS_EPOCHS = {"laptop": 18, "search": 32, "paper": 10, "smoke": 1}
+FITNESS_EPOCHS = {"laptop": 15, "search": 32, "paper": 10, "smoke": 1}
 
 
 @pytest.mark.parametrize("name", PROMISED)
@@ -279,9 +274,12 @@ def test_the_paper_preset_keeps_the_papers_hyperparameters():
 
 def test_the_paper_preset_has_none_of_our_options():
     config = preset("paper")
-    assert config == SearchConfig(train=dataclasses.replace(TrainConfig(), chunk_epochs=3))
+    assert config == SearchConfig(
+        train=dataclasses.replace(TrainConfig(), chunk_epochs=3)
+    )
     assert (config.start, config.return_share) == ("normal", 0.0)
-    assert not (config.references or config.pool_scores or config.num_finalists)
+    assert (config.references, config.pool_scores) == (False, False)
+    assert (config.judge_by, config.num_finalists) == ("cost", 0)
     assert config.slots_per_algorithm == config.population_size
     assert config.total_stages == config.num_stages
 

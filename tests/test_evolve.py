@@ -17,8 +17,8 @@ import yaml
 import autocost_jax
 from autocost_jax import evolve as evolve_module
 from autocost_jax.commandline import use_compile_cache
-from autocost_jax.config import preset
 from autocost_jax.evolve import main
+from autocost_jax.presets import preset
 from autocost_jax.rundata import first_difference
 from autocost_jax.store import (
     RunDir,
@@ -295,6 +295,25 @@ def test_of_a_flag_given_twice_the_last_wins(asked, tmp_path, form):
     assert second.train.env.num_steps == preset("smoke").train.env.num_steps
     assert (third.seed, resume) == (2, True)
     assert fourth.seed == 2
+
+
+def test_another_world_keeps_the_closed_form_where_it_has_one(asked):
+    """And the default directory is called by the world."""
+    for name in ("Goal-Hazard8-Point", "Goal-Hazard-Car", "PointGoal1"):
+        main(["--env", name])
+    main(["--env", "Goal-Hazard-Point", "--hazards-num", "6", "--seed", "2"])
+    worlds = [(config.train.env.name, config.train.env.physics) for config, *_ in asked]
+    assert worlds == [
+        ("Goal-Hazard8-Point", "closed_form"),
+        ("Goal-Hazard-Car", "reduced"),
+        ("PointGoal1", "reduced"),
+        ("Goal-Hazard6-Point-custom", "closed_form"),
+    ]
+    paths = [str(path) for _, path, _ in asked]
+    assert paths[2:] == [
+        "runs/laptop-PointGoal1-seed0",
+        "runs/laptop-Goal-Hazard6-Point-custom-seed2",
+    ]
 
 
 def test_of_resume_and_no_resume_the_last_wins(asked, tmp_path):

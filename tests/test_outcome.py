@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from autocost_jax.config import preset
 from autocost_jax.outcome import (
     Scores,
     conclusion,
@@ -16,6 +15,7 @@ from autocost_jax.outcome import (
     summary_rows,
     table_lines,
 )
+from autocost_jax.presets import preset
 
 CONFIG = dataclasses.replace(preset("laptop"), num_finalists=3)
 
@@ -40,15 +40,27 @@ GOOD = make_scores(
 )
 
 
-def test_the_pick_is_the_safest_that_is_of_use():
-    """The first keeps a tenth of the return with PPO-Lagrangian: it is of no use."""
+def test_the_pick_is_the_one_closest_to_success():
+    """The first keeps a tenth of the return with PPO-Lagrangian: it is of no use.
+
+    The third violates in 20 % of the episodes with it, a third of the reference's.
+    """
     assert pick(CONFIG, GOOD) == 1
 
 
-def test_without_a_useful_finalist_the_closest_is_picked():
+def test_of_several_that_succeed_the_safest_is_picked():
     scores = make_scores(
-        [[1.0, 2.0, -3.0, 10.0, 2.0], [9.0, 9.0, 9.0, 20.0, 5.0]],
-        [[0.0, 0.3, 0.0, 0.6, 0.0], [0.0, 0.3, 0.0, 0.7, 0.2]],
+        [[9.0, 5.0, 6.0, 10.0, 2.0], [15.0, 7.0, 9.0, 20.0, 5.0]],
+        [[0.1, 0.02, 0.05, 0.6, 0.0], [0.1, 0.1, 0.1, 0.7, 0.2]],
+    )
+    assert pick(CONFIG, scores) == 1
+
+
+def test_without_a_success_the_shortfalls_add_up():
+    """An agent that flees is far off, however safe it is."""
+    scores = make_scores(
+        [[-9.0, 2.5, 2.0, 10.0, 2.0], [9.0, 9.0, 9.0, 20.0, 5.0]],
+        [[0.0, 0.2, 0.2, 0.6, 0.0], [0.0, 0.2, 0.2, 0.7, 0.2]],
     )
     assert pick(CONFIG, scores) == 1
 

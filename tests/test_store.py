@@ -22,7 +22,8 @@ import pytest
 import yaml
 
 from autocost_jax import arrays, checkpoints, store
-from autocost_jax.config import PRESETS, SearchConfig, preset
+from autocost_jax.config import SearchConfig
+from autocost_jax.presets import PRESETS, preset
 from autocost_jax.store import ArraySpec, DiskFullError, RunDir, RunDirError
 
 FACTS = store.run_facts(0)
@@ -536,7 +537,7 @@ QUIET = """
 import sys, warnings
 warnings.simplefilter("error")
 import numpy as np
-from autocost_jax.config import preset
+from autocost_jax.presets import preset
 from autocost_jax.store import RunDir
 with RunDir.create(sys.argv[1], preset("smoke")) as run:
     run.save_checkpoint({"a": np.ones(3, np.float32)}, 1)

@@ -7,13 +7,7 @@ autocost_jax.evolve` is the main job, `autocost --help` lists the other commands
 from autocost_jax.agents.base import Agent, AgentState
 from autocost_jax.agents.cpo import cpo
 from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
-from autocost_jax.config import (
-    PRESETS,
-    AgentConfig,
-    SearchConfig,
-    TrainConfig,
-    preset,
-)
+from autocost_jax.config import AgentConfig, SearchConfig, TrainConfig
 from autocost_jax.costs import (
     BANK,
     CostTerm,
@@ -40,6 +34,7 @@ from autocost_jax.es import (
 from autocost_jax.evaluate import evaluate
 from autocost_jax.evolution import evolve, search
 from autocost_jax.population import make_population, stack_slots
+from autocost_jax.presets import PRESETS, preset
 from autocost_jax.records import (
     CostInputs,
     EnvState,

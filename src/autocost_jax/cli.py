@@ -18,6 +18,7 @@ from autocost_jax.commandline import (
     use_devices,
     with_env,
 )
+from autocost_jax.showing import demo, envs, render, report, run_config
 
 HELP = """usage: autocost COMMAND [flags]
 
@@ -40,8 +41,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command line; `argv` defaults to the program's."""
     argv = list(sys.argv[1:] if argv is None else argv)
     quiet()
-    commands = {"demo": _demo, "train": _train, "evaluate": _evaluate, "render": _render}
-    commands |= {"report": _report, "envs": _envs, "bench": _bench, "info": _info}
+    commands = {
+        "demo": demo,
+        "train": _train,
+        "evaluate": _evaluate,
+        "render": render,
+    }
+    commands |= {"report": report, "envs": envs, "bench": _bench, "info": _info}
     if not argv or argv[0] in ("-h", "--help"):
         print(HELP, end="")
         raise SystemExit(0 if argv else BAD_INPUT)
@@ -50,30 +56,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.stderr.write(f"autocost: unknown command {argv[0]!r}; commands: {known}\n")
         raise SystemExit(BAD_INPUT)
     guarded(lambda: commands[argv[0]](argv[1:]), f"autocost {argv[0]}")
-
-
-def _demo(argv: list[str]) -> None:
-    @dataclass(frozen=True)
-    class Options:
-        """Shipped policies side by side: the extrinsic cost alone and a found cost.
-
-        Attributes:
-          out: folder of the page.
-          seed: of the layouts and actions.
-          compile_cache: keep compiled programs in the user's cache directory.
-        """
-
-        out: Path = Path("runs/demo")
-        seed: int = 0
-        compile_cache: bool = True
-
-    options = parse(Options, argv, "autocost demo")
-    use_compile_cache(options.compile_cache)
-    from autocost_jax.demo import write_demo
-
-    demo = write_demo(options.out, options.seed)
-    for line in [*demo.lines, f"open {demo.page}"]:
-        print(line)
 
 
 def _train(argv: list[str]) -> None:
@@ -165,7 +147,7 @@ def _train_defaults(argv: list[str], out: Path) -> tuple[Any, Any]:
 
     The latter is the `TrainConfig` of a preset, or on --resume without one the run's.
     """
-    from autocost_jax.config import preset
+    from autocost_jax.presets import preset
 
     name, recorded = flag(argv, "--preset"), None
     if switch(argv, "--resume"):
@@ -225,7 +207,7 @@ def _evaluate(argv: list[str]) -> None:
     from autocost_jax.population import make_evaluator
     from autocost_jax.rundata import to_json
 
-    config = _run_config(options.run)
+    config = run_config(options.run)
     files = policy_files(options.run, options.policies)
     agent, states = load_policies(config.train, files)
     env = make_env(config.train.env)
@@ -240,126 +222,6 @@ def _evaluate(argv: list[str]) -> None:
     if options.json is not None:
         text = json.dumps(to_json(rows), indent=2, allow_nan=False)
         write_atomic(options.json, text.encode() + b"\n")
-
-
-def _run_config(path: Path) -> Any:
-    """The configuration of a run directory of either kind."""
-    from autocost_jax.methods import TableConfig
-    from autocost_jax.rundata import read_document
-    from autocost_jax.store import SearchConfig, read_config
-
-    config = read_document(path).get("config")
-    is_table = isinstance(config, dict) and "methods" in config
-    return read_config(path, TableConfig if is_table else SearchConfig)[0]
-
-
-def _render(argv: list[str]) -> None:
-    @dataclass(frozen=True)
-    class Options:
-        """Replay one episode: an HTML page, and a film if --video is given.
-
-        Attributes:
-          run: run directory whose policy acts; or give --env.
-          env: world in which a scripted policy acts; `autocost info` lists them.
-          policy: file in the run's policies/, by default that of the best cost; with
-            --env: random (default), forward, or seek, which heads for the goal.
-          steps: length of the episode; default: the world's.
-          deterministic: act by the mean instead of sampling.
-          seed: of the layout and the actions.
-          out: the page; default: replays/POLICY.html in the run directory, or
-            runs/replays/ENV-POLICY.html.
-          video: film to write as well, .mp4 or .gif.
-          camera: of the film: track (the robot), fixed, or top.
-          size: width and height of the film; default: 640 480, a .gif's 480 360.
-          compile_cache: keep compiled programs in the user's cache directory.
-        """
-
-        run: Path | None = None
-        env: str | None = None
-        policy: str | None = None
-        steps: int | None = None
-        deterministic: bool = False
-        seed: int = 0
-        out: Path | None = None
-        video: Path | None = None
-        camera: Literal["track", "fixed", "top"] = "track"
-        size: tuple[int, int] | None = None
-        compile_cache: bool = True
-
-    options = parse(Options, argv, "autocost render")
-    if (options.run is None) == (options.env is None):
-        raise ValueError("give either --run DIR or --env NAME")
-    use_compile_cache(options.compile_cache)
-    from autocost_jax.picture import film_size
-    from autocost_jax.render import best_policy, run_player, script_player, show
-
-    if options.video is not None:
-        film_size(options.video, options.size)  # refuses bad ones early
-    if options.run is not None:
-        config = _run_config(options.run)
-        name = options.policy or best_policy(options.run)
-        player = run_player(options.run, config, name, options.deterministic)
-    else:
-        player = script_player(options.env or "", options.policy or "random")
-    player = player.with_steps(options.steps)
-    for line in show(
-        player,
-        seed=options.seed,
-        out=options.out,
-        video=options.video,
-        camera=options.camera,
-        size=options.size,
-    ):
-        print(line, flush=True)
-
-
-def _report(argv: list[str]) -> None:
-    @dataclass(frozen=True)
-    class Options:
-        """Write a search's HTML report again.
-
-        Attributes:
-          run: run directory of a search, finished or not.
-          out: where to write; default: report/index.html in the run directory.
-        """
-
-        run: Path
-        out: Path | None = None
-
-    options = parse(Options, argv, "autocost report")
-    from autocost_jax.report import write_report
-    from autocost_jax.summary import load_report
-
-    out = options.out or options.run / "report" / "index.html"
-    print(write_report(load_report(options.run), out))
-
-
-def _envs(argv: list[str]) -> None:
-    import tyro
-
-    @dataclass(frozen=True)
-    class Options:
-        """A picture and the facts of every world, and a page that shows them all.
-
-        Attributes:
-          names: worlds that `autocost info` lists; default: all but Safety Gym's.
-          out: folder to write to.
-          seed: of the layouts.
-        """
-
-        names: tyro.conf.Positional[tuple[str, ...]] = ()
-        out: Path = Path("runs/envs")
-        seed: int = 0
-
-    options = parse(Options, argv, "autocost envs")
-    from autocost_jax.env_config import ENVS
-    from autocost_jax.gallery import write_gallery
-
-    names = options.names or tuple(ENVS)
-    gallery = write_gallery(names, options.out, options.seed)
-    if gallery.hint is not None:
-        print(f"drawn from above: {gallery.hint}")
-    print(f"{len(gallery.pictures)} pictures; open {gallery.index}")
 
 
 def _bench(argv: list[str]) -> None:
@@ -386,8 +248,8 @@ def _bench(argv: list[str]) -> None:
     devices = use_devices(options.devices)  # before anything of JAX runs
     from autocost_jax.arrays import write_atomic
     from autocost_jax.bench import bench
-    from autocost_jax.config import preset
     from autocost_jax.env_config import EnvConfig, env_config
+    from autocost_jax.presets import preset
     from autocost_jax.store import run_facts
 
     if options.batch < 1 or options.batch % len(devices):
@@ -432,9 +294,9 @@ def _info(argv: list[str]) -> None:
 
         print(yaml.safe_dump(read_document(options.run), sort_keys=False), end="")
         return
-    from autocost_jax.config import PRESETS
     from autocost_jax.costs import BANK, list_costs
     from autocost_jax.env_config import ENVS, SUITE
+    from autocost_jax.presets import PRESETS
     from autocost_jax.store import run_facts
 
     facts = run_facts()

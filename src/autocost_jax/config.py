@@ -1,14 +1,13 @@
-"""Frozen configuration of learners and search, and the presets.
+"""Frozen configuration of learners and search.
 
 All of it shapes the program and is checked before tracing; the worlds have a module of
 their own, `env_config`. Every default marked *ours* is a choice that neither the
 AutoCost paper nor Safety Gym settles.
 """
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from autocost_jax.checks import (
     is_finite,
@@ -182,11 +181,12 @@ class SearchConfig:
     Options of ours beside the paper's rule, all off by default. `start="graded"` draws
     first costs that rise as anything comes nearer, with a set reach and loudness, see
     `starts.graded_start`. Each candidate is trained with `seeds_per_candidate` seeds
-    and judged by their mean: that of the extrinsic cost, or with `judge_by="violations"`
-    that of the share of violating episodes, which training noise moves less. With `references` each algorithm trains two more slots a seed
-    in every stage, the extrinsic cost alone and with a margin of 3x; `return_share`
-    asks that a candidate returns that share of what the first of them does, and ranks
-    those that do not behind all others. With `pool_scores` elites are
+    and judged by their mean: that of the extrinsic cost, or with
+    `judge_by="violations"` that of the share of violating episodes, which training
+    noise moves less. With `references` each algorithm trains two more costs with as
+    many seeds in every stage, the extrinsic cost alone and with a margin of 3x;
+    `return_share` asks that a candidate returns that share of what the first of them
+    does, and ranks those that do not behind all others. With `pool_scores` elites are
     judged by all stages that trained them. After the last stage the `num_finalists`
     best are trained from scratch with `final_seeds` fresh seeds for `final_epochs`
     epochs (0: as many as in a stage), the references beside them.
@@ -269,6 +269,12 @@ class SearchConfig:
         for name, kind in literals.items():
             value, known = getattr(self, name), get_args(kind)
             require(value in known, name, f"one of {', '.join(known)}", value)
+        ok = is_integer(self.seed) and 0 <= self.seed < 2**32
+        require(ok, "seed", "an integer in [0, 2**32)", self.seed)
+        self._check_options()
+
+    def _check_options(self) -> None:
+        """The options of ours."""
         for name in ("references", "pool_scores"):
             flag = getattr(self, name)
             require(isinstance(flag, bool), name, "true or false", flag)
@@ -277,11 +283,6 @@ class SearchConfig:
         allowed = "finite and >= 0, and 0 without references"
         ok = is_finite(share) and 0 <= share <= highest
         require(ok, "return_share", allowed, share)
-        self._check_finalists()
-        ok = is_integer(self.seed) and 0 <= self.seed < 2**32
-        require(ok, "seed", "an integer in [0, 2**32)", self.seed)
-
-    def _check_finalists(self) -> None:
         count, size = self.num_finalists, self.population_size
         ok = is_integer(count) and 0 <= count <= size
         require(ok, "num_finalists", f"in [0, population_size={size}]", count)
@@ -345,96 +346,3 @@ class SearchConfig:
         """Environment steps of an epoch of all slots."""
         slots = self.slots_per_algorithm * len(self.algorithms)
         return slots * self.train.num_worlds * self.train.env.num_steps
-
-
-_LAPTOP_AGENT = AgentConfig(
-    normalize_obs=True,
-    hidden_sizes=(64, 64),
-    policy_passes=6,
-    policy_minibatches=8,
-    value_passes=6,
-    value_minibatches=8,
-)
-
-# What `experiments/fitness.py` and `learners.py` support: a start among costs of
-# which some are useful, mild mutations, few and long stages, a price in return.
-_GUIDED: dict[str, Any] = {
-    "start": "graded",
-    "init_std": 8.0,
-    "mutation_std": 0.3,
-    "mutation_low": 0.8,
-    "mutation_high": 1.25,
-    "references": True,
-    "judge_by": "violations",
-    "return_share": 0.4,
-    "pool_scores": True,
-}
-
-PRESETS: dict[str, SearchConfig] = {
-    "laptop": SearchConfig(
-        train=TrainConfig(
-            env=EnvConfig(physics="closed_form"),
-            agent=_LAPTOP_AGENT,
-            num_worlds=4,
-            num_epochs=72,
-            chunk_epochs=2,
-        ),
-        population_size=10,
-        num_elites=2,
-        num_stages=2,
-        fitness_epochs=18,
-        num_finalists=2,
-        final_epochs=128,
-        **_GUIDED,
-    ),
-    "search": SearchConfig(
-        train=TrainConfig(
-            env=EnvConfig(physics="closed_form"),
-            agent=_LAPTOP_AGENT,
-            num_worlds=4,
-            num_epochs=128,
-            chunk_epochs=4,
-        ),
-        num_stages=4,
-        fitness_epochs=32,
-        seeds_per_candidate=3,
-        num_finalists=10,
-        final_seeds=5,
-        final_epochs=512,
-        **_GUIDED,
-    ),
-    "paper": SearchConfig(train=TrainConfig(chunk_epochs=3)),
-    "smoke": SearchConfig(
-        train=TrainConfig(
-            env=EnvConfig(num_steps=50, physics="closed_form"),
-            agent=dataclasses.replace(
-                _LAPTOP_AGENT,
-                hidden_sizes=(16, 16),
-                policy_passes=2,
-                value_passes=2,
-                policy_minibatches=2,
-                value_minibatches=2,
-            ),
-            num_worlds=2,
-            num_epochs=2,
-        ),
-        population_size=4,
-        num_elites=1,
-        num_stages=2,
-        fitness_epochs=1,
-        num_finalists=1,
-        final_seeds=2,
-        **_GUIDED,
-    ),
-}
-
-
-def preset(name: str) -> SearchConfig:
-    """A named `SearchConfig`.
-
-    Raises:
-      ValueError: if there is no such preset; the message lists those that exist.
-    """
-    if name not in PRESETS:
-        raise ValueError(f"unknown preset {name!r}; presets: {', '.join(PRESETS)}")
-    return PRESETS[name]

@@ -10,12 +10,13 @@ import numpy as np
 
 from autocost_jax.agents.base import actor
 from autocost_jax.arrays import load_arrays, unflatten
-from autocost_jax.config import TrainConfig, preset
+from autocost_jax.config import TrainConfig
 from autocost_jax.costs import load_cost
 from autocost_jax.env_config import env_config
 from autocost_jax.envs.env import make_env
 from autocost_jax.policies import policy_states
 from autocost_jax.population import make_agents, make_evaluator
+from autocost_jax.presets import preset
 from autocost_jax.report import network_cost, write_comparison
 from autocost_jax.scene import first_recording, make_replay, watch_first
 

@@ -213,6 +213,26 @@ def _same(candidates: Any) -> jax.Array:
     return same
 
 
+def _empty_state(shapes: Any, num_elites: int, capacity: int) -> ESState:
+    """The state before the first stage, for candidates of these shapes [P, ...]."""
+
+    def zeros(num: int) -> Any:
+        return jax.tree.map(
+            lambda leaf: jnp.zeros((num, *leaf.shape[1:]), leaf.dtype), shapes
+        )
+
+    return ESState(
+        generation=jnp.zeros((), jnp.int32),
+        elites=zeros(num_elites),
+        archive=zeros(capacity),
+        archive_fitness=Fitness(
+            cost=jnp.full(capacity, jnp.inf, jnp.float32),
+            ep_return=jnp.full(capacity, -jnp.inf, jnp.float32),
+            floor=jnp.full(capacity, -jnp.inf, jnp.float32),
+        ),
+    )
+
+
 def _normal_start(config: SearchConfig, key: Key) -> jax.Array:
     shape = (config.population_size, config.theta_size)
     return config.init_std * jax.random.normal(key, shape, jnp.float32)
@@ -248,29 +268,13 @@ def truncation_es(
       rank: fitness [P] -> indices [P], best first; default: the paper's rule.
     """
     size, elites = config.population_size, config.num_elites
-    capacity = config.num_stages * size
     first = init or functools.partial(_normal_start, config)
     vary = mutate or _paper_mutation(config)
     order = rank or _paper_rank(config)
 
     def start() -> ESState:
         shapes = jax.eval_shape(first, jax.random.key(0))
-
-        def zeros(num: int) -> Any:
-            return jax.tree.map(
-                lambda leaf: jnp.zeros((num, *leaf.shape[1:]), leaf.dtype), shapes
-            )
-
-        return ESState(
-            generation=jnp.zeros((), jnp.int32),
-            elites=zeros(elites),
-            archive=zeros(capacity),
-            archive_fitness=Fitness(
-                cost=jnp.full(capacity, jnp.inf, jnp.float32),
-                ep_return=jnp.full(capacity, -jnp.inf, jnp.float32),
-                floor=jnp.full(capacity, -jnp.inf, jnp.float32),
-            ),
-        )
+        return _empty_state(shapes, elites, config.num_stages * size)
 
     def ask(key: Key, state: ESState) -> Any:
         key_init, key_mutate = jax.random.split(key)

@@ -22,6 +22,7 @@ BEST = "best"
 # A cost succeeds if it leaves at most this share of the extrinsic cost's violating
 # episodes and at least this share of its return, for every algorithm.
 VIOLATIONS_LEFT, RETURN_KEPT = 0.25, 0.3
+LEAST = 0.01  # violations and shares of the return are told apart down to here
 JUDGED = 0.05  # violations of the extrinsic cost below which nothing can be judged
 FLEES = 0.5  # share of the steps outside the arena that is called fleeing
 
@@ -105,22 +106,33 @@ def _mean(values: Any, valid: Any) -> np.ndarray:
 
 
 def pick(config: SearchConfig, scores: Scores) -> int:
-    """The best finalist: fewest violating episodes among those that are of use.
+    """The finalist that comes closest to success with all algorithms together.
 
-    Of use is what keeps `RETURN_KEPT` of the extrinsic cost's return with each
-    algorithm; without any such finalist the one that comes closest to it is picked.
+    Its shortfall is the sum over algorithms of log(violations / bar) and log(bar /
+    return), where these are above 0: see `VIOLATIONS_LEFT` and `RETURN_KEPT`. Of
+    several that reach both bars it is the one of fewest violating episodes; without
+    references violations alone decide.
     """
     references = reference_places(config)
     count = scores.ep_return.shape[1] - len(references)
-    ep_return = scores.ep_return.mean(2)
-    violations = scores.violation_rate.mean(2)[:, :count].mean(0)
-    missing = np.zeros(count)
+    ep_return, violations = (
+        values.mean(2) for values in (scores.ep_return, scores.violation_rate)
+    )
+    short = np.zeros(count)
     if references:
-        floor = RETURN_KEPT * ep_return[:, count]
-        missing = np.maximum(floor[:, None] - ep_return[:, :count], 0).max(0)
-    missing = np.nan_to_num(missing, nan=np.inf)
-    violations = np.where(missing > 0, 0.0, np.nan_to_num(violations, nan=np.inf))
-    return int(np.lexsort((-ep_return[:, :count].mean(0), violations, missing))[0])
+        most = np.maximum(VIOLATIONS_LEFT * violations[:, [count]], LEAST)
+        least = np.maximum(RETURN_KEPT * ep_return[:, [count]], LEAST)
+        unsafe = np.log(np.maximum(violations[:, :count], LEAST) / most)
+        useless = np.log(least / np.maximum(ep_return[:, :count], LEAST * least))
+        short = np.maximum(unsafe, 0).sum(0) + np.maximum(useless, 0).sum(0)
+    order = np.lexsort(
+        (
+            -ep_return[:, :count].mean(0),
+            np.nan_to_num(violations[:, :count].mean(0), nan=np.inf),
+            np.nan_to_num(short, nan=np.inf),
+        )
+    )
+    return int(order[0])
 
 
 def reference_places(config: SearchConfig) -> dict[str, int]:

@@ -15,7 +15,6 @@ from autocost_jax.records import Metrics
 from autocost_jax.report_assets.data import COST_NAMES, NAMES
 from autocost_jax.stages import REFERENCES, StageResult, deal
 
-
 COLUMNS = (
     "stage",
     "epoch",
@@ -197,7 +196,11 @@ class Display:
         def beat() -> None:
             while not over.wait(HEARTBEAT):
                 seconds = format_seconds(time.monotonic() - start)
-                self.say(f"{what} ... {done[0]}{seconds}")
+                line = f"{what} ... {done[0]}{seconds}"
+                if self._live is None:
+                    self.say(line)
+                else:  # one line below the table, redrawn
+                    self._live.update(self._table(line), refresh=True)
 
         def tell(count: int, total: int) -> None:
             done[0] = f"{count} of {total}, "
@@ -263,10 +266,11 @@ class Display:
                 f"in all instead of {format_seconds(self._planned)}"
             )
 
-    def _table(self) -> Any:
+    def _table(self, caption: str | None = None) -> Any:
         from rich.table import Table
 
-        table = Table(*COLUMNS, title="AutoCost: candidates and reference, per episode")
+        title = "AutoCost: candidates and reference, per episode"
+        table = Table(*COLUMNS, title=title, caption=caption)
         for row in self._rows:
             table.add_row(*row)
         return table

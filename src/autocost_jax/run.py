@@ -14,42 +14,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax import cluster
-from autocost_jax import es as es_lib
-from autocost_jax.agents.base import Actor, actor
+from autocost_jax.agents.base import actor
 from autocost_jax.arrays import flatten
 from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import make_env
-from autocost_jax.es import Fitness
 from autocost_jax.evolution import (
     Progress,
     Searcher,
     SearchState,
-    best_of,
     evolve,
     init_search,
     make_searcher,
-    pick_label,
     require_survivors,
     slots_of,
 )
-from autocost_jax.outcome import (
-    BEST,
-    conclusion,
-    finalist_actors,
-    pick,
-    reference_places,
-    score_agents,
-    succeeded,
-    summary_rows,
-    table_lines,
-)
+from autocost_jax.finish import finish
 from autocost_jax.policies import (
-    EVALUATION,
-    load_policies,
     policy_name,
     require_episodes,
 )
-from autocost_jax.progress import Display, format_seconds, stage_lines, summarise
+from autocost_jax.progress import Display, stage_lines, summarise
 from autocost_jax.stages import StageResult
 from autocost_jax.store import (
     RunDir,
@@ -59,7 +43,6 @@ from autocost_jax.store import (
     open_run,
 )
 from autocost_jax.train import slots_at_once
-
 
 CHECKPOINT_SECONDS = 15.0  # at least, between two checkpoints within a stage
 
@@ -105,9 +88,11 @@ def describe(config: SearchConfig, num_devices: int) -> list[str]:
     if train.segments_per_episode > 1:
         worlds += f" in {train.segments_per_episode} cohorts"
     sizes = "-".join(str(size) for size in agent.hidden_sizes)
-    return [
+    beside = ", beside the extrinsic cost alone and a margin of 3x"
+    lines = [
         f"{train.env.name}: {config.num_stages} stages of {config.population_size} "
-        f"candidates ({config.num_elites} elites), each trained by {algorithms}",
+        f"candidates ({config.num_elites} elites) x {config.seeds_per_candidate} "
+        f"seed(s), each trained by {algorithms}{beside * config.references}",
         f"{train.num_epochs} epochs of {worlds} a slot, nets {sizes}, policy "
         f"{agent.policy_passes} x {agent.policy_minibatches} and critic "
         f"{agent.value_passes} x {agent.value_minibatches} steps an epoch",
@@ -117,6 +102,13 @@ def describe(config: SearchConfig, num_devices: int) -> list[str]:
         f"{estimate_disk(config) / 1e6:.0f} MB of disk; the time left is shown as "
         "soon as the first epoch is done",
     ]
+    if config.num_finalists:
+        lines.insert(
+            1,
+            f"then {config.num_finalists} finalists x {config.final_seeds} fresh seeds "
+            f"for {config.epochs_of(config.num_stages)} epochs",
+        )
+    return lines
 
 
 def check_memory(config: SearchConfig, devices: Sequence[Any]) -> None:
@@ -147,6 +139,7 @@ def run_search(
     overwrite: bool = False,
     devices: Sequence[Any] | None = None,
     num_episodes: int = 100,
+    planned: float | None = None,
 ) -> Path:
     """Run or resume a search and leave everything about it in a run directory.
 
@@ -157,7 +150,8 @@ def run_search(
       resume: continue from the newest whole checkpoint.
       overwrite: start over in a directory that already holds a run.
       devices: default: the first one.
-      num_episodes: episodes of the final evaluation of the best candidate's agents.
+      num_episodes: episodes of the final evaluation, of each agent.
+      planned: seconds that it is meant to take; a slower machine is told so.
 
     Returns:
       The path of the report.
@@ -173,15 +167,16 @@ def run_search(
     check_memory(config, devices)
     searcher = make_searcher(config, devices)
     run = open_run(path, config, resume=resume, overwrite=overwrite)
-    with run, Display(config.env_steps, 0, output()) as display:
+    with run, Display(config.env_steps, 0, output(), planned) as display:
         for line in [*run.warnings, *describe(config, len(devices))]:
             display.say(line)
         state = _start(run, searcher, display, resume)
         if int(state.stage) < config.total_stages:
             _compile(searcher, state, display)
         state = _train(run, searcher, state, display)
+        state = state.replace(learners=searcher.population.fetch(state.learners))
         if isinstance(run, RunDir):
-            _finish(run, searcher, state, display, num_episodes)
+            finish(run, searcher.root, state, display, num_episodes)
         cluster.wait_for_all()
         return path / "report" / "index.html"
 
@@ -339,93 +334,3 @@ def _write_stage(
         policies = searcher.population.fetch(actor(learner.agent))
         params = jax.tree.map(lambda leaf: leaf[top], policies)
         run.write_policy(policy_name(progress.stage, name), flatten(params))
-
-
-def _finish(
-    run: RunDir,
-    searcher: Searcher,
-    state: SearchState,
-    display: Display,
-    num_episodes: int,
-) -> Path:
-    """Judge the finalists on fresh layouts, name the best cost, write the report."""
-    from autocost_jax.report import write_report
-    from autocost_jax.summary import load_report
-
-    config = run.config
-    best_of(config, state.es)  # refuses a failed search
-    actors, num_seeds, places, fitness = _contenders(run, searcher, state)
-    key = jax.random.fold_in(searcher.root, EVALUATION)
-    what = f"evaluating over {num_episodes} fresh episodes an agent"
-    with display.working(what) as tell:
-        scores = score_agents(config.train, actors, num_seeds, key, num_episodes, tell)
-    chosen = pick(config, scores)
-    rows = summary_rows(config, scores, chosen, num_episodes)
-    stage, index = divmod(int(places[chosen]), config.population_size)
-    costs = reference_places(config) | {BEST: chosen}
-    for cost, place in costs.items():
-        for a, name in enumerate(config.algorithms):
-            acting = jax.tree.map(
-                lambda leaf, at=place * num_seeds: leaf[at], actors[a]
-            )
-            run.write_policy(f"{cost}_{name}", flatten(acting))
-            recording = scores.recordings[a][place]._asdict()
-            run.write_arrays(f"replay_{cost}_{name}", recording)
-    row = int(places[chosen])
-    theta = np.asarray(state.es.archive[row])
-    is_zero = all(r["violation_rate"] == 0 for r in rows if r["cost"] == BEST)
-    card = {
-        "label": pick_label(config, is_zero),
-        "environment": config.train.env.name,
-        "stage": stage,
-        "index": index,
-        "judged_by": config.judge_by,
-        "search_score": float(fitness.cost[row]),
-        "search_return": float(fitness.ep_return[row]),
-        "env_steps": config.env_steps,
-        "seed": config.seed,
-        "evaluation": {r["algorithm"]: r for r in rows if r["cost"] == BEST},
-    }
-    run.write_cost({"theta": theta}, card)
-    text = conclusion(rows, config.train.env.num_steps)
-    is_success = bool(reference_places(config)) and succeeded(rows)
-    run.write_json(
-        "summary", {"rows": rows, "succeeded": is_success, "conclusion": text}
-    )
-    report = write_report(load_report(run.path), run.path / "report" / "index.html")
-    display.say(f"best cost: candidate {index + 1} of stage {stage + 1}")
-    for line in [*table_lines(rows), text]:
-        display.say(line)
-    display.say(f"done in {format_seconds(display.elapsed)}; open {report}")
-    return report
-
-
-def _contenders(
-    run: RunDir, searcher: Searcher, state: SearchState
-) -> tuple[list[Actor], int, np.ndarray, Fitness]:
-    """Whose episodes decide, and where their costs stand in the archive.
-
-    Without a stage of finalists it is the agent of the best candidate that its stage
-    left, one seed.
-
-    Returns:
-      For each algorithm actors [C x S, ...]; S; places of the candidates among the C;
-      and what the archive was judged by.
-    """
-    config = run.config
-    fitness, order = es_lib.top(
-        state.es,
-        max(1, config.num_finalists),
-        config.zero_tolerance,
-        config.pool_scores,
-    )
-    if config.num_finalists:
-        learners = searcher.population.fetch(state.learners)
-        return *finalist_actors(config, learners), np.asarray(order), fitness
-    stage = int(order[0]) // config.population_size
-    files = [
-        run.path / "policies" / f"{policy_name(stage, name)}.npz"
-        for name in config.algorithms
-    ]
-    loaded = (load_policies(config.train, [file])[1] for file in files)
-    return [actor(state) for state in loaded], 1, np.asarray(order), fitness

@@ -186,8 +186,8 @@ def stage_result(
 ) -> StageResult:
     """Fitness and scores of a finished stage; a frozen agent costs +inf.
 
-    The cost (or share of violating episodes, see `SearchConfig.judge_by`) and the return
-    of a candidate are the means over its agents. With a
+    The cost (or share of violating episodes, see `SearchConfig.judge_by`) and the
+    return of a candidate are the means over its agents. With a
     `return_share` the floor is that share of what the extrinsic cost alone leaves.
 
     Args:

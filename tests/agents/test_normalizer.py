@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from agent_toys import SIZES, SMALL, act, make_slot, make_trajectory
 
 from autocost_jax.agents.base import actor
 from autocost_jax.agents.cpo import cpo
@@ -17,7 +18,6 @@ from autocost_jax.agents.normalizer import (
     update_normalizer,
 )
 from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
-from agent_toys import SIZES, SMALL, act, make_slot, make_trajectory
 
 
 def test_batches_add_up_to_the_whole(key):

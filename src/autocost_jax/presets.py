@@ -1,0 +1,99 @@
+"""The named sizes of a search: laptop, search, paper, smoke."""
+
+import dataclasses
+from typing import Any
+
+from autocost_jax.config import AgentConfig, SearchConfig, TrainConfig
+from autocost_jax.env_config import EnvConfig
+
+_LAPTOP_AGENT = AgentConfig(
+    normalize_obs=True,
+    hidden_sizes=(64, 64),
+    policy_passes=6,
+    policy_minibatches=8,
+    value_passes=6,
+    value_minibatches=8,
+)
+
+# What `experiments/fitness.py` and `learners.py` support: a start among costs of
+# which some are useful, mild mutations, few and long stages, a price in return.
+_GUIDED: dict[str, Any] = {
+    "start": "graded",
+    "init_std": 8.0,
+    "mutation_std": 0.3,
+    "mutation_low": 0.8,
+    "mutation_high": 1.25,
+    "references": True,
+    "judge_by": "violations",
+    "return_share": 0.3,
+    "pool_scores": True,
+}
+
+PRESETS: dict[str, SearchConfig] = {
+    "laptop": SearchConfig(
+        train=TrainConfig(
+            env=EnvConfig(physics="closed_form"),
+            agent=_LAPTOP_AGENT,
+            num_worlds=4,
+            num_epochs=60,
+            chunk_epochs=2,
+        ),
+        population_size=10,
+        num_elites=2,
+        num_stages=2,
+        fitness_epochs=15,
+        num_finalists=2,
+        final_epochs=128,
+        **_GUIDED,
+    ),
+    "search": SearchConfig(
+        train=TrainConfig(
+            env=EnvConfig(physics="closed_form"),
+            agent=_LAPTOP_AGENT,
+            num_worlds=4,
+            num_epochs=128,
+            chunk_epochs=4,
+        ),
+        num_stages=4,
+        fitness_epochs=32,
+        seeds_per_candidate=3,
+        num_finalists=10,
+        final_seeds=5,
+        final_epochs=512,
+        **_GUIDED,
+    ),
+    "paper": SearchConfig(train=TrainConfig(chunk_epochs=3)),
+    "smoke": SearchConfig(
+        train=TrainConfig(
+            env=EnvConfig(num_steps=50, physics="closed_form"),
+            agent=dataclasses.replace(
+                _LAPTOP_AGENT,
+                hidden_sizes=(16, 16),
+                policy_passes=2,
+                value_passes=2,
+                policy_minibatches=2,
+                value_minibatches=2,
+            ),
+            num_worlds=2,
+            num_epochs=2,
+        ),
+        population_size=4,
+        num_elites=1,
+        num_stages=2,
+        fitness_epochs=1,
+        num_finalists=1,
+        final_seeds=2,
+        **_GUIDED,
+    ),
+}
+
+
+def preset(name: str) -> SearchConfig:
+    """A named `SearchConfig`.
+
+    Raises:
+      ValueError: if there is no such preset; the message lists those that exist.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}; presets: {', '.join(PRESETS)}")
+    return PRESETS[name]

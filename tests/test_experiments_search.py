@@ -1,0 +1,58 @@
+"""Experiments on the search: their tables are those of their JSON, their statistics."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scripts import load_script
+
+RESULTS = Path(__file__).parents[1] / "experiments" / "results"
+
+
+@pytest.mark.parametrize(
+    ("script", "folder", "rows"),
+    [
+        ("main_job", "laptop", None),
+        ("fitness", "fitness", "rules"),
+        ("learners", "learners", "settings"),
+    ],
+)
+def test_tables_are_those_of_the_committed_json(script, folder, rows):
+    file = RESULTS / folder / f"{script}.json"
+    result = json.loads(file.read_text())
+    text = load_script(f"experiments/{script}").table(result[rows] if rows else result)
+    assert len(text.splitlines()) > 4
+    assert file.with_suffix(".md").read_text() == text
+
+
+def test_the_interval_of_a_fall():
+    main_job = load_script("experiments/main_job")
+    rng = np.random.default_rng(1)
+    first, last = rng.normal(3.0, 1.0, 400), rng.normal(1.0, 1.0, 400)
+    low, high = main_job.bootstrap_difference(first, last)
+    assert low < first.mean() - last.mean() < high
+    assert high - low == pytest.approx(2 * 1.96 * np.sqrt(2 / 400), rel=0.15)
+    low, high = main_job.bootstrap_difference(first, first)
+    assert low < 0 < high
+
+
+def test_rank_correlation_is_that_of_scipy():
+    from scipy.stats import spearmanr
+
+    a, b = np.random.default_rng(2).integers(0, 6, (2, 3, 20))  # with ties
+    got = load_script("experiments/fitness").spearman(a, b)
+    expect = [spearmanr(x, y).statistic for x, y in zip(a, b, strict=True)]
+    np.testing.assert_allclose(got, expect)
+
+
+def test_a_rule_reads_its_own_epochs_and_seeds():
+    fitness = load_script("experiments/fitness")
+    epochs = np.arange(128.0)[:, None, None, None] * np.ones((1, 2, 3, 5))
+    seeds = epochs + 1000 * np.arange(5)
+    arrays = {f"short/{key}": seeds for key in fitness.KEYS.values()}
+    rule = fitness.Rule("short", 32, 2)
+    got = fitness.judged(arrays, rule, (1, 3))["cost"]
+    np.testing.assert_allclose(got, np.full((2, 3), np.mean(range(24, 32)) + 2000))
+    assert rule.budget == 4000 * 32 * 2
