@@ -386,7 +386,7 @@ def test_a_run_that_failed_stays_failed(monkeypatch, tmp_path, capsys):
     assert list(list_stages(path)) == [0]
     data = load_report(path)
     assert data.best is None
-    assert "every candidate of a stage diverged" in render_report(data)
+    assert "Every candidate of a stage diverged" in render_report(data)
 
     # As an earlier version left it, which resumed past the failure.
     card = {"stage": 0, "index": 0, "search_cost": "Infinity", "evaluation": {}}
@@ -435,7 +435,7 @@ def test_seeds_and_references_are_slots(key):
     assert len(np.unique(keys[0], axis=0)) == 3
     np.testing.assert_array_equal(keys, np.broadcast_to(keys[:1], keys.shape))
     assert not np.isin(jax.random.key_data(other.key), keys).all()
-    np.testing.assert_array_equal(group.cost.theta[3:6], candidates[[1, 1, 1]])
+    np.testing.assert_array_equal(group.cost.theta[3:6], np.asarray(candidates)[[1, 1, 1]])
     named = dict(zip([t.name for t in BANK], group.cost.weights.T, strict=True))
     used = {name: np.flatnonzero(weight).tolist() for name, weight in named.items()}
     assert used["extrinsic"] == list(range(18))

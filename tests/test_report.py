@@ -250,7 +250,7 @@ def test_all_candidates_may_diverge():
     stage = make_stage(np.random.default_rng(1), 3, 2.0, frozen=(0, 1, 2))
     data = make_data(stages=(stage, stage), best=None, conclusion="")
     check_page(report.render_report(data))
-    assert "Every candidate diverged" in report.verdict(data)
+    assert "Every candidate of a stage diverged" in report.verdict(data)
 
 
 def test_non_finite_replay_stays_strict_json():

@@ -147,15 +147,15 @@ def search(
 
         stages = jnp.arange(config.num_stages)
         state, told = jax.lax.scan(body, functions.init(), stages)
-        candidates, slots = functions.begin_final(state)
-        final_scores: Metrics = {}
+        finalists, final_scores = state.elites[:0], {}
         if config.num_finalists:
+            candidates, slots = functions.begin_final(state)
+            finalists = candidates[: config.num_finalists]
             history, _ = train(slots, config.epochs_of(config.num_stages))
             dealt = deal(config, is_final=True)
             for name, value in history.items():
                 last = dealt.table(value[-config.fitness_epochs :])
                 final_scores[name] = jnp.mean(last, axis=0)
-        finalists = candidates[: config.num_finalists]
         return SearchResult(state, *told, finalists, final_scores)
 
     return run

@@ -49,7 +49,7 @@ def _from_stages(data: ReportData) -> str:
             "had no violation."
         )
     if data.best is None:
-        return f"{text} Every candidate diverged, so there is no best cost."
+        return f"{text} Every candidate of a stage diverged, so there is no best cost."
     stage, index = data.stages[data.best.stage], data.best.index
     return (
         f"{text} Best so far: {candidate_name(data.best.stage, index)} (return "
