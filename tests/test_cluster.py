@@ -86,7 +86,7 @@ def test_only_the_first_process_speaks_and_writes(both):
     lines = [line for line in second.splitlines() if not line.startswith("[Gloo]")]
     assert lines == []
     assert (out / "report" / "index.html").exists()
-    assert len(read_metrics(out)) == 4  # one row an epoch, not two
+    assert len(read_metrics(out)) == 6  # one row an epoch, not two
 
 
 def test_it_is_the_search_of_one_process(both, environment, tmp_path):
@@ -107,7 +107,8 @@ def test_it_is_the_search_of_one_process(both, environment, tmp_path):
 def test_a_crash_ends_the_others_and_one_process_can_go_on(environment, tmp_path):
     """In one line and soon; then the run is resumed on another number of devices."""
     out = tmp_path / "crashed"
-    first, second = start_both(out, environment, *FLAGS, "--num-epochs", "60")
+    flags = [*FLAGS, "--num-epochs", "60", "--num-finalists", "0"]
+    first, second = start_both(out, environment, *flags)
     deadline = time.monotonic() + WAIT
     while not list(out.glob("checkpoints/step_*")):
         assert first.poll() is None
@@ -118,8 +119,8 @@ def test_a_crash_ends_the_others_and_one_process_can_go_on(environment, tmp_path
     said, _ = first.communicate(timeout=60)
     assert first.returncode == 1, said
     assert said.splitlines()[-1].startswith("python -m autocost_jax.evolve: ")
-    flags = ("--resume", "--devices", "1", "--eval-episodes", "4")
-    resumed = start(out, environment, *flags)
+    again = ("--resume", "--devices", "1", "--eval-episodes", "4")
+    resumed = start(out, environment, *again)
     said, _ = resumed.communicate(timeout=WAIT)
     assert resumed.returncode == 0, said
     assert "resuming" in said

@@ -435,7 +435,9 @@ def test_seeds_and_references_are_slots(key):
     assert len(np.unique(keys[0], axis=0)) == 3
     np.testing.assert_array_equal(keys, np.broadcast_to(keys[:1], keys.shape))
     assert not np.isin(jax.random.key_data(other.key), keys).all()
-    np.testing.assert_array_equal(group.cost.theta[3:6], np.asarray(candidates)[[1, 1, 1]])
+    np.testing.assert_array_equal(
+        group.cost.theta[3:6], np.asarray(candidates)[[1, 1, 1]]
+    )
     named = dict(zip([t.name for t in BANK], group.cost.weights.T, strict=True))
     used = {name: np.flatnonzero(weight).tolist() for name, weight in named.items()}
     assert used["extrinsic"] == list(range(18))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from autocost_jax import gallery, picture, scene
+from autocost_jax.agents.base import actor
 from autocost_jax.arrays import flatten
 from autocost_jax.cli import main
 from autocost_jax.env_config import ENVS, SUITE, EnvConfig, env_config
@@ -128,7 +129,7 @@ def run_dir(tmp_path_factory):
     config = TableConfig(train=train, methods=(Method("ppo", "ppo"),), seeds=(0,))
     (agent,) = make_agents(("ppo_lagrangian",), train, make_env(train.env))
     with RunDir.create(path, config) as run:
-        run.write_policy("ppo_seed0", flatten(agent.init(jax.random.key(0)).policy))
+        run.write_policy("ppo_seed0", flatten(actor(agent.init(jax.random.key(0)))))
     return path
 
 
