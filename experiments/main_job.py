@@ -147,7 +147,7 @@ def table(result: dict[str, Any]) -> str:
         "cost per episode | steps outside | seeds x episodes |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for seed, best in zip(SEEDS, result["best"], strict=True):
+    for seed, best in zip(result["seeds"], result["best"], strict=True):
         for row in best["rows"]:
             who = f"| {seed} | {row['algorithm']} | {row['cost']} | "
             lines.append(
@@ -161,7 +161,7 @@ def table(result: dict[str, Any]) -> str:
         "(at least 30 %) | reached |",
         "|---|---|---|---|---|",
     ]
-    for seed, best in zip(SEEDS, result["best"], strict=True):
+    for seed, best in zip(result["seeds"], result["best"], strict=True):
         for name in ("ppo_lagrangian", "cpo"):
             row = best[name]
             lines.append(
@@ -182,8 +182,9 @@ def figure(result: dict[str, Any], runs: Path, path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    fig, axes = plt.subplots(1, 2 + len(SEEDS), figsize=(15, 3.4))
-    for axis, seed in zip(axes, SEEDS, strict=False):
+    seeds = result["seeds"]
+    fig, axes = plt.subplots(1, 2 + len(seeds), figsize=(15, 3.4))
+    for axis, seed in zip(axes, seeds, strict=False):
         for shift, selection in ((-0.1, "paper"), (0.1, "random")):
             path_of = search_dir(runs, selection, seed)
             if not (path_of / "summary.json").exists():
@@ -202,11 +203,11 @@ def figure(result: dict[str, Any], runs: Path, path: Path) -> None:
     axes[0].set_ylabel("extrinsic cost per episode")
     axes[0].legend(fontsize=7)
     marks = {"extrinsic": "s", "safety_margin_3x": "^", "best": "o"}
-    for axis, name in zip(axes[len(SEEDS) :], ("ppo_lagrangian", "cpo"), strict=True):
-        for seed, best in zip(SEEDS, result["best"], strict=True):
+    for axis, name in zip(axes[len(seeds) :], ("ppo_lagrangian", "cpo"), strict=True):
+        for seed, best in zip(result["seeds"], result["best"], strict=True):
             for cost, mark in marks.items():
                 row = row_of(best["rows"], name, cost)
-                label = cost if seed == SEEDS[0] else None
+                label = cost if seed == result["seeds"][0] else None
                 where = (100 * row["violation_rate"], row["return"])
                 axis.plot(*where, mark, color=f"C{seed}", label=label)
         axis.set(title=name, xlabel="violating episodes, %", ylabel="return")
@@ -217,11 +218,17 @@ def figure(result: dict[str, Any], runs: Path, path: Path) -> None:
 
 def collect(runs: Path, results: Path) -> None:
     """JSON, table and figure of all runs."""
-    papers = [search_dir(runs, "paper", seed) for seed in SEEDS]
-    controls = [search_dir(runs, "random", seed) for seed in SEEDS]
+    seeds = [
+        seed
+        for seed in SEEDS
+        if (search_dir(runs, "paper", seed) / "summary.json").exists()
+    ]
+    papers = [search_dir(runs, "paper", seed) for seed in seeds]
+    controls = [search_dir(runs, "random", seed) for seed in seeds]
     result = {
         "command": "python experiments/main_job.py run && "
         "python experiments/main_job.py collect",
+        "seeds": seeds,
         "config": read_document(papers[0])["config"],
         "searches": [search_row(*pair) for pair in zip(papers, controls, strict=True)],
         "best": [best_row(path) for path in papers],
