@@ -76,7 +76,7 @@ def costs(env: Env, size: Size) -> np.ndarray:
     """Theta [C, 41] of all costs; the references' are unused zeros, in front."""
     key_graded, key_normal = jax.random.split(jax.random.key(2026))
     places = typical_lidars(env, jax.random.key(0))
-    ranges = {"quiet_places": (10.0, 75.0), "loud_costs": (0.01, 0.5)}
+    ranges: dict[str, Any] = {"quiet_places": (10.0, 75.0), "loud_costs": (0.01, 0.5)}
     graded = graded_start(key_graded, size.graded, 8.0, places, **ranges)
     normal = 5.0 * jax.random.normal(key_normal, (size.normal, 41))
     none = jnp.zeros((len(REFERENCES), 41))
@@ -150,7 +150,7 @@ def run(path: Path, size: Size, config: TrainConfig, seconds: float) -> None:
     agents = make_agents(ALGORITHMS, config, env)
     population = make_population(env, agents, config, devices=jax.devices())
     theta = costs(env, size)
-    arrays: dict[str, np.ndarray] = {"theta": theta}
+    arrays: dict[str, Any] = {"theta": theta}
 
     def keep(name: str, metrics: dict[str, np.ndarray]) -> None:
         for key, value in metrics.items():

@@ -201,8 +201,9 @@ def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network):
 
 def test_a_graded_start_keeps_to_other_ranges(key):
     places = typical_lidars(make_env("Goal-Hazard-Point"), jax.random.key(1), 256)
-    ranges = {"quiet_places": (60.0, 70.0), "loud_costs": (0.4, 0.5)}
-    theta = graded_start(key, 50, 8.0, places, **ranges)
+    theta = graded_start(
+        key, 50, 8.0, places, quiet_places=(60.0, 70.0), loud_costs=(0.4, 0.5)
+    )
     costs = np.asarray(jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta))
     quiet = 100 * (costs < QUIET_COST).mean(1)
     assert (quiet > 59).all()

@@ -494,7 +494,7 @@ def test_the_floor_is_a_share_of_what_the_extrinsic_cost_leaves():
     ep_return = cost + jnp.array([1.0, 2.0, 3.0, 4.0, 10.0, 50.0])
     history = make_history(cost, ep_return)
     result = stage_result(FINALS, jnp.zeros((4, 41)), history, jnp.zeros((2, 6), bool))
-    np.testing.assert_allclose(result.fitness.floor, 3.0)
+    np.testing.assert_allclose(jnp.asarray(result.fitness.floor), 3.0)
     assert result.order.tolist() == [3, 2, 1, 0]
     assert result.references["ep_return"].tolist() == [[10.0, 50.0]] * 2
 

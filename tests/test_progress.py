@@ -4,6 +4,7 @@ import dataclasses
 import io
 import time
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -89,12 +90,12 @@ def test_all_broken_is_shown_as_such():
 
 def test_a_finished_stage_is_compared_with_its_references():
     """Candidates and stages count from 1."""
-    history = {name: np.zeros((27, 2, 6)) for name in TRACKED}
-    history["ep_return"][:, :, 3] = 12.0  # extrinsic alone
-    history["violating_worlds"][:, :, 3] = 0.71
-    history["ep_cost"][:] = 1.0
-    history["ep_cost"][:, :, 1] = 0.0  # the second candidate is best
-    result = stage_result(CONFIG, np.zeros((3, 41)), history, np.zeros((2, 6), bool))
+    zeros = jnp.zeros((27, 2, 6))
+    history = dict.fromkeys(TRACKED, zeros)
+    history["ep_return"] = zeros.at[:, :, 3].set(12.0)  # extrinsic alone
+    history["violating_worlds"] = zeros.at[:, :, 3].set(0.71)
+    history["ep_cost"] = (zeros + 1.0).at[:, :, 1].set(0.0)  # the second is best
+    result = stage_result(CONFIG, jnp.zeros((3, 41)), history, jnp.zeros((2, 6), bool))
     lines = stage_lines(CONFIG, 0, result)
     assert lines[0].startswith("stage 1, ")
     assert lines[1].split()[:4] == ["extrinsic", "cost", "alone", "PPO-Lagrangian"]

@@ -21,7 +21,7 @@ from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
 
 
 def test_batches_add_up_to_the_whole(key):
-    obs = np.asarray(3.0 + 5.0 * jax.random.normal(key, (7, 40, 3)))
+    obs = 3.0 + 5.0 * jax.random.normal(key, (7, 40, 3))
     normalizer = init_normalizer(3)
     for batch in obs:
         normalizer = update_normalizer(normalizer, batch, jnp.ones(40))
