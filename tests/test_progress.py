@@ -91,7 +91,7 @@ def test_all_broken_is_shown_as_such():
 def test_a_finished_stage_is_compared_with_its_references():
     """Candidates and stages count from 1."""
     zeros = jnp.zeros((27, 2, 6))
-    history = dict.fromkeys(TRACKED, zeros)
+    history: dict[str, jnp.ndarray] = {name: zeros for name in TRACKED}
     history["ep_return"] = zeros.at[:, :, 3].set(12.0)  # extrinsic alone
     history["violating_worlds"] = zeros.at[:, :, 3].set(0.71)
     history["ep_cost"] = (zeros + 1.0).at[:, :, 1].set(0.0)  # the second is best
