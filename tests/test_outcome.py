@@ -115,7 +115,9 @@ def test_agents_that_flee_are_called_so():
 
 def test_short_episodes_judge_nothing():
     safe = make_scores(np.full((2, 5), 1.0), np.zeros((2, 5)))
-    text = conclusion(summary_rows(CONFIG, safe, 0, 100), 50)
+    rows = summary_rows(CONFIG, safe, 0, 100)
+    assert not succeeded(rows)  # though nothing violates at the full return
+    text = conclusion(rows, 50)
     assert "50 steps" in text
     assert "too short to judge safety" in text
 

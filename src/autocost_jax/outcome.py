@@ -172,8 +172,16 @@ def row_of(rows: list[dict[str, Any]], algorithm: str, cost: str) -> dict[str, A
     return next(r for r in rows if (r["algorithm"], r["cost"]) == (algorithm, cost))
 
 
+def _can_be_judged(rows: list[dict[str, Any]]) -> bool:
+    """Whether agents violate at all that learn with the extrinsic cost alone."""
+    plain = [row["violation_rate"] for row in rows if row["cost"] == "extrinsic"]
+    return max(plain) >= JUDGED
+
+
 def succeeded(rows: list[dict[str, Any]]) -> bool:
     """Whether the best cost is safer than the extrinsic one at a bearable price."""
+    if not _can_be_judged(rows):
+        return False
     for name in dict.fromkeys(row["algorithm"] for row in rows):
         best, plain = row_of(rows, name, BEST), row_of(rows, name, "extrinsic")
         is_safe = best["violation_rate"] <= VIOLATIONS_LEFT * plain["violation_rate"]
@@ -187,8 +195,7 @@ def conclusion(rows: list[dict[str, Any]], num_steps: int) -> str:
     """In words, whether the search succeeded and at which price."""
     if not any(row["cost"] == "extrinsic" for row in rows):
         return "No reference was trained beside the search, so success is not judged."
-    plain = [row["violation_rate"] for row in rows if row["cost"] == "extrinsic"]
-    if max(plain) < JUDGED:
+    if not _can_be_judged(rows):
         return (
             f"Hardly any agent violated in {num_steps} steps even with the extrinsic "
             "cost alone: episodes are too short to judge safety."
