@@ -284,7 +284,8 @@ def _tracked(metrics: tuple[Metrics, ...]) -> Metrics:
 
 def pick_label(config: SearchConfig, is_zero: bool) -> str:
     """In words, by which rule the final pick of a search was made."""
-    label = "zero violation, highest return" if is_zero else "lowest cost"
+    lowest = {"cost": "lowest cost", "violations": "fewest violating episodes"}
+    label = "zero violation, highest return" if is_zero else lowest[config.judge_by]
     if not config.return_share:
         return label
     return f"{label} of those that keep {config.return_share:.0%} of the return"
