@@ -31,6 +31,7 @@ from autocost_jax.envs.env import make_env
 from autocost_jax.evaluate import evaluate
 from autocost_jax.methods import Method, TableConfig, table_slots
 from autocost_jax.population import make_agents, make_population
+from autocost_jax.presets import preset
 from autocost_jax.store import run_facts
 
 STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
@@ -43,6 +44,7 @@ BASE: dict[str, Any] = {
     "value_minibatches": 8,
 }
 NORM = {"normalize_obs": True}
+FAST = NORM | {"target_kl": 0.02, "multiplier_lr": 0.02}
 # name -> worlds an epoch, segments per episode, agent settings that differ from BASE
 SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "as before": (8, 1, {}),
@@ -50,10 +52,10 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "4 worlds": (4, 1, NORM),
     "4 worlds, multiplier lr 0.02": (4, 1, NORM | {"multiplier_lr": 0.02}),
     "4 worlds in 4 cohorts": (4, 4, NORM),
-    "2 worlds": (2, 1, NORM),
-    "4 worlds, KL 0.02": (4, 1, NORM | {"target_kl": 0.02}),
-    "4 worlds, log std -1": (4, 1, NORM | {"log_std_init": -1.0}),
-    "4 worlds, lr 1e-3": (4, 1, NORM | {"policy_lr": 1e-3, "value_lr": 3e-3}),
+    "8 worlds, KL 0.02": (8, 1, NORM | {"target_kl": 0.02}),
+    "8 worlds, KL 0.02, multiplier lr 0.02": (8, 1, FAST),
+    "the same, 32-32": (8, 1, FAST | {"hidden_sizes": (32, 32)}),
+    "the preset": (8, 1, dataclasses.asdict(preset("laptop").train.agent)),
 }
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 

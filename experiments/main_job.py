@@ -25,9 +25,10 @@ from typing import Any
 import numpy as np
 
 from autocost_jax.arrays import load_arrays
-from autocost_jax.outcome import RETURN_KEPT, VIOLATIONS_LEFT, row_of
+from autocost_jax.outcome import row_of
 from autocost_jax.rundata import read_document, to_json
 from autocost_jax.store import list_stages, read_config
+from autocost_jax.success import RETURN_KEPT, VIOLATIONS_LEFT
 
 SEEDS = (0, 1, 2)
 WORDS = {True: "yes", False: "no", None: "not measured"}

@@ -52,8 +52,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def compilation_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Programs that two tests have in common are compiled once a session."""
-    path = tmp_path_factory.getbasetemp() / "jax_cache"
+    """Programs that two tests have in common are compiled once for all workers.
+
+    Where JAX_COMPILATION_CACHE_DIR is set, they are kept there for the next run too.
+    """
+    worker = "PYTEST_XDIST_WORKER" in os.environ  # its base is a folder of the run's
+    base = tmp_path_factory.getbasetemp()
+    run = base.parent if worker else base
+    path = os.environ.get("JAX_COMPILATION_CACHE_DIR") or run / "jax_cache"
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(path)  # for command lines under test
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

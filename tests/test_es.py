@@ -118,37 +118,6 @@ def test_equal_costs_fall_to_the_higher_return():
     assert rank(fitness).tolist() == [1, 2, 0]
 
 
-def with_floor(fitness, floor):
-    return fitness.replace(floor=jnp.full_like(fitness.cost, floor))
-
-
-def test_below_the_floor_only_the_return_counts():
-    """Behind all others, however safe, but before what is not finite."""
-    costs = [0.0, 3.0, 1.0, 0.5, np.nan, 1.0]
-    returns = [-2.0, 4.0, 2.0, 1.9, 9.0, 5.0]
-    fitness = make_fitness(costs, returns)
-    assert rank(with_floor(fitness, 2.0)).tolist() == [5, 2, 1, 3, 0, 4]
-    assert selected(with_floor(fitness, 2.0)) == [5, 2]
-    assert rank(fitness).tolist() == rank(with_floor(fitness, -3.0)).tolist()
-
-
-def test_a_floor_that_nobody_reaches_asks_for_return():
-    fitness = make_fitness([0.0, 3.0, 1.0], [0.0, 1.0, -1.0])
-    assert rank(with_floor(fitness, 10.0)).tolist() == [1, 0, 2]
-
-
-def test_best_with_a_floor_is_useful(key):
-    es = truncation_es(SMALL)
-    candidates = es.ask(key, es.init())
-    size = len(candidates)
-    fitness = make_fitness([0.0, *[2.0] * (size - 1)], [0.0, *[3.0] * (size - 1)])
-    state = es.tell(key, es.init(), candidates, fitness)
-    assert int(best(state, size).index) == 0
-    state = es.tell(key, es.init(), candidates, with_floor(fitness, 1.0))
-    assert int(best(state, size).index) == 1
-    np.testing.assert_array_equal(state.elites[0], candidates[1])
-
-
 # Pooled scores ---------------------------------------------------------------
 
 

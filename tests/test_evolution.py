@@ -451,7 +451,7 @@ FINALS = dataclasses.replace(
     num_stages=2,
     fitness_epochs=1,
     references=True,
-    return_share=0.3,
+    judge_by="success",
     pool_scores=True,
     num_finalists=2,
     final_seeds=2,
@@ -489,14 +489,18 @@ def test_the_pure_search_trains_the_same_finalists():
     )
 
 
-def test_the_floor_is_a_share_of_what_the_extrinsic_cost_leaves():
-    cost = jnp.zeros((3, 2, 6))
-    ep_return = cost + jnp.array([1.0, 2.0, 3.0, 4.0, 10.0, 50.0])
-    history = make_history(cost, ep_return)
+def test_success_is_judged_against_the_extrinsic_cost_for_each_algorithm():
+    """Fleeing agents, a useful cost, one that is safe with PPO alone, a useful one."""
+    rates = [[0.0, 0.1, 0.0, 0.05, 0.8, 0.1], [0.0, 0.2, 0.8, 0.1, 0.8, 0.1]]
+    ep_return = jnp.broadcast_to(jnp.array([-5.0, 4, 9, 3, 10, 1]), (3, 2, 6))
+    history = make_history(jnp.zeros((3, 2, 6)), ep_return)
+    history["violating_worlds"] = jnp.broadcast_to(jnp.array(rates), (3, 2, 6))
     result = stage_result(FINALS, jnp.zeros((4, 41)), history, jnp.zeros((2, 6), bool))
-    np.testing.assert_allclose(jnp.asarray(result.fitness.floor), 3.0)
-    assert result.order.tolist() == [3, 2, 1, 0]
-    assert result.references["ep_return"].tolist() == [[10.0, 50.0]] * 2
+    far = [2 * np.log(100), 0.0, np.log(0.8 / 0.2), 0.0]
+    means = [0.0, 0.15, 0.4, 0.075]
+    np.testing.assert_allclose(result.fitness.cost, np.add(far, means), rtol=1e-5)
+    assert result.order.tolist() == [3, 1, 2, 0]
+    assert result.references["ep_return"].tolist() == [[10.0, 1.0]] * 2
 
 
 def test_a_candidate_is_judged_by_the_mean_over_its_seeds():

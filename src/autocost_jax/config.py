@@ -5,7 +5,6 @@ their own, `env_config`. Every default marked *ours* is a choice that neither th
 AutoCost paper nor Safety Gym settles.
 """
 
-import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
@@ -22,7 +21,7 @@ from autocost_jax.env_config import EnvConfig
 Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
 Start = Literal["normal", "graded"]
-Judge = Literal["cost", "violations"]
+Judge = Literal["cost", "success"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 CostNetwork = Literal["dense", "nearest"]
 THETA_SIZES: dict[CostNetwork, int] = {"dense": 41, "nearest": 13}
@@ -181,15 +180,15 @@ class SearchConfig:
     Options of ours beside the paper's rule, all off by default. `start="graded"` draws
     first costs that rise as anything comes nearer, with a set reach and loudness, see
     `starts.graded_start`. Each candidate is trained with `seeds_per_candidate` seeds
-    and judged by their mean: that of the extrinsic cost, or with
-    `judge_by="violations"` that of the share of violating episodes, which training
-    noise moves less. With `references` each algorithm trains two more costs with as
-    many seeds in every stage, the extrinsic cost alone and with a margin of 3x;
-    `return_share` asks that a candidate returns that share of what the first of them
-    does, and ranks those that do not behind all others. With `pool_scores` elites are
-    judged by all stages that trained them. After the last stage the `num_finalists`
-    best are trained from scratch with `final_seeds` fresh seeds for `final_epochs`
-    epochs (0: as many as in a stage), the references beside them.
+    and judged by their mean. With `references` each algorithm trains two more costs
+    with as many seeds in every stage, the extrinsic cost alone and with a margin of 3x.
+    `judge_by="success"` compares candidates with the first of them, by violating
+    episodes and return and for each algorithm, see `success.shortfall`; the paper's
+    rule alone rewards costs that make agents flee or stand still, as these are the
+    first to be safe. With `pool_scores` elites are judged by all stages that trained
+    them. After the last stage the `num_finalists` best are trained from scratch with
+    `final_seeds` fresh seeds for `final_epochs` epochs (0: as many as in a stage), the
+    references beside them.
     With `network="nearest"` candidates are networks of 13 parameters that see only how
     near the closest object is, see `costs.intrinsic_logit`; "dense" is the paper's.
     """
@@ -213,7 +212,6 @@ class SearchConfig:
     seeds_per_candidate: int = 1
     references: bool = False
     judge_by: Judge = "cost"
-    return_share: float = 0.0
     pool_scores: bool = False
     num_finalists: int = 0
     final_seeds: int = 3
@@ -278,11 +276,8 @@ class SearchConfig:
         for name in ("references", "pool_scores"):
             flag = getattr(self, name)
             require(isinstance(flag, bool), name, "true or false", flag)
-        share = self.return_share
-        highest = math.inf if self.references else 0.0
-        allowed = "finite and >= 0, and 0 without references"
-        ok = is_finite(share) and 0 <= share <= highest
-        require(ok, "return_share", allowed, share)
+        ok = self.references or self.judge_by != "success"
+        require(ok, "judge_by", '"cost" without references', self.judge_by)
         count, size = self.num_finalists, self.population_size
         ok = is_integer(count) and 0 <= count <= size
         require(ok, "num_finalists", f"in [0, population_size={size}]", count)

@@ -166,6 +166,25 @@ def training_cost(
       ValueError: unknown term (the message lists the bank), bad weight, theta of
         another shape, or no theta although the method uses the network.
     """
+    weights, theta = parse_cost(method, theta, limit, bank)
+    return TrainingCost(
+        weights=jnp.asarray(weights),
+        theta=jnp.asarray(theta, jnp.float32),
+        limit=jnp.asarray(limit, jnp.float32),
+    )
+
+
+def parse_cost(
+    method: str,
+    theta: jax.Array | np.ndarray | None = None,
+    limit: float = 0.0,
+    bank: Sequence[CostTerm] = BANK,
+) -> tuple[np.ndarray, jax.Array | np.ndarray]:
+    """Weights [len(bank)] and theta [D] that a method names; JAX is not started.
+
+    A configuration is read and checked with it before a run's processes meet.
+    Arguments and errors are those of `training_cost`.
+    """
     if isinstance(limit, float | int) and not np.isfinite(limit):
         raise ValueError(f"limit must be finite, got {limit}")
     names = [term.name for term in bank]
@@ -195,11 +214,7 @@ def training_cost(
         theta = np.zeros(THETA_SIZES["dense"], np.float32)
     if not _is_theta(np.shape(theta)):
         raise ValueError(f"theta must have {_SIZES} parameters, got {np.shape(theta)}")
-    return TrainingCost(
-        weights=jnp.asarray(weights),
-        theta=jnp.asarray(theta, jnp.float32),
-        limit=jnp.asarray(limit, jnp.float32),
-    )
+    return weights, theta
 
 
 def save_cost(

@@ -27,13 +27,10 @@ class Fitness(struct.PyTreeNode):
       cost: [P] what is to be low, such as the mean extrinsic cost per episode; +inf for
         a broken candidate.
       ep_return: [P] return per episode; -inf for a broken candidate.
-      floor: [P] return below which a candidate is of no use; None: there is no such
-        demand. See `rank`.
     """
 
     cost: jax.Array
     ep_return: jax.Array
-    floor: jax.Array | None = None
 
     @property
     def finite(self) -> jax.Array:
@@ -102,21 +99,12 @@ def rank(fitness: Fitness, zero_tolerance: float = 0.0) -> jax.Array:
     One lexicographic sort covers both branches of the paper's rule: with more
     zero-violation candidates than elites the highest returns win, otherwise the lowest
     costs. Anything non-finite comes last.
-
-    Where the fitness has floors (ours), candidates that return less than theirs come
-    after all others and are compared by return alone (the feasibility rule of Deb 2000,
-    "An efficient constraint handling method for genetic algorithms"). Without them
-    costs that make agents flee or stand still win, as they are the first to be safe.
     """
     ok = fitness.finite
     cost = jnp.where(fitness.cost <= zero_tolerance, 0.0, fitness.cost)
     cost = jnp.where(ok, cost, jnp.inf)
     loss = jnp.where(ok, -fitness.ep_return, jnp.inf)
-    if fitness.floor is None:
-        return jnp.lexsort((loss, cost))
-    is_low = ok & (fitness.ep_return < fitness.floor)
-    cost = jnp.where(is_low, 0.0, cost)
-    return jnp.lexsort((loss, cost, is_low, ~ok))
+    return jnp.lexsort((loss, cost))
 
 
 def select(
@@ -228,7 +216,6 @@ def _empty_state(shapes: Any, num_elites: int, capacity: int) -> ESState:
         archive_fitness=Fitness(
             cost=jnp.full(capacity, jnp.inf, jnp.float32),
             ep_return=jnp.full(capacity, -jnp.inf, jnp.float32),
-            floor=jnp.full(capacity, -jnp.inf, jnp.float32),
         ),
     )
 
@@ -287,8 +274,6 @@ def truncation_es(
         )
 
     def tell(key: Key, state: ESState, candidates: Any, fitness: Fitness) -> ESState:
-        if fitness.floor is None:
-            fitness = fitness.replace(floor=jnp.full_like(fitness.cost, -jnp.inf))
         place = state.generation * size
 
         def put(old: jax.Array, new: jax.Array) -> jax.Array:
@@ -361,9 +346,8 @@ def best(
 ) -> Best:
     """The final pick: of all zero-violation candidates the one of highest return.
 
-    Without any, that of lowest cost; `zero_violation` says which it is. Where the
-    fitness has floors either of those that reach them; if none does, the highest
-    return. Of a failed search there is no pick, see `Best`.
+    Without any, that of lowest cost; `zero_violation` says which it is. Of a failed
+    search there is no pick, see `Best`.
     """
     fitness, order = top(state, 1, zero_tolerance, pool_scores)
     index = order[0]

@@ -284,11 +284,9 @@ def _tracked(metrics: tuple[Metrics, ...]) -> Metrics:
 
 def pick_label(config: SearchConfig, is_zero: bool) -> str:
     """In words, by which rule the final pick of a search was made."""
-    lowest = {"cost": "lowest cost", "violations": "fewest violating episodes"}
-    label = "zero violation, highest return" if is_zero else lowest[config.judge_by]
-    if not config.return_share:
-        return label
-    return f"{label} of those that keep {config.return_share:.0%} of the return"
+    if is_zero:
+        return "zero violation, highest return"
+    return {"cost": "lowest cost", "success": "closest to success"}[config.judge_by]
 
 
 def require_survivors(config: SearchConfig, state: ESState) -> None:

@@ -20,7 +20,7 @@ from autocost_jax import cluster
 from autocost_jax.agents.base import actor
 from autocost_jax.arrays import flatten
 from autocost_jax.config import Algorithm, TrainConfig
-from autocost_jax.costs import training_cost
+from autocost_jax.costs import parse_cost, training_cost
 from autocost_jax.envs.env import make_env
 from autocost_jax.policies import (
     EVALUATION,
@@ -77,7 +77,7 @@ class Method:
                 f"algorithm must be ppo, ppo_lagrangian or cpo, got {self.algorithm!r}"
             )
         theta = None if self.theta is None else np.asarray(self.theta)
-        training_cost(self.cost, theta, self.limit)
+        parse_cost(self.cost, theta, self.limit)
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,10 @@ from autocost_jax.records import EvalResult, Key
 from autocost_jax.report_assets.data import COST_NAMES, NAMES
 from autocost_jax.scene import Recording, first_recording, watch_first
 from autocost_jax.stages import REFERENCES, deal
+from autocost_jax.success import RETURN_KEPT, VIOLATIONS_LEFT, shortfall
 from autocost_jax.train import Learner
 
 BEST = "best"
-# A cost succeeds if it leaves at most this share of the extrinsic cost's violating
-# episodes and at least this share of its return, for every algorithm.
-VIOLATIONS_LEFT, RETURN_KEPT = 0.25, 0.3
-LEAST = 0.01  # violations and shares of the return are told apart down to here
 JUDGED = 0.05  # violations of the extrinsic cost below which nothing can be judged
 FLEES = 0.5  # share of the steps outside the arena that is called fleeing
 
@@ -106,11 +103,9 @@ def _mean(values: Any, valid: Any) -> np.ndarray:
 
 
 def pick(config: SearchConfig, scores: Scores) -> int:
-    """The finalist that comes closest to success with all algorithms together.
+    """The finalist that comes closest to success, see `shortfall`.
 
-    Its shortfall is the sum over algorithms of log(violations / bar) and log(bar /
-    return), where these are above 0: see `VIOLATIONS_LEFT` and `RETURN_KEPT`. Of
-    several that reach both bars it is the one of fewest violating episodes; without
+    Of several that succeed it is the one of fewest violating episodes; without
     references violations alone decide.
     """
     references = reference_places(config)
@@ -120,11 +115,8 @@ def pick(config: SearchConfig, scores: Scores) -> int:
     )
     short = np.zeros(count)
     if references:
-        most = np.maximum(VIOLATIONS_LEFT * violations[:, [count]], LEAST)
-        least = np.maximum(RETURN_KEPT * ep_return[:, [count]], LEAST)
-        unsafe = np.log(np.maximum(violations[:, :count], LEAST) / most)
-        useless = np.log(least / np.maximum(ep_return[:, :count], LEAST * least))
-        short = np.maximum(unsafe, 0).sum(0) + np.maximum(useless, 0).sum(0)
+        costs = (violations[:, :count], ep_return[:, :count])
+        short = np.asarray(shortfall(*costs, violations[:, count], ep_return[:, count]))
     order = np.lexsort(
         (
             -ep_return[:, :count].mean(0),

@@ -8,15 +8,18 @@ from autocost_jax.env_config import EnvConfig
 
 _LAPTOP_AGENT = AgentConfig(
     normalize_obs=True,
-    hidden_sizes=(64, 64),
-    policy_passes=6,
+    hidden_sizes=(32, 32),
+    target_kl=0.02,
+    policy_passes=4,
     policy_minibatches=8,
-    value_passes=6,
+    value_passes=4,
     value_minibatches=8,
+    multiplier_lr=0.02,
+    cg_iterations=5,
 )
 
 # What `experiments/fitness.py` and `learners.py` support: a start among costs of
-# which some are useful, mild mutations, few and long stages, a price in return.
+# which some are useful, mild mutations, few and long stages, success as the measure.
 _GUIDED: dict[str, Any] = {
     "start": "graded",
     "init_std": 8.0,
@@ -24,8 +27,7 @@ _GUIDED: dict[str, Any] = {
     "mutation_low": 0.8,
     "mutation_high": 1.25,
     "references": True,
-    "judge_by": "violations",
-    "return_share": 0.3,
+    "judge_by": "success",
     "pool_scores": True,
 }
 
@@ -34,32 +36,32 @@ PRESETS: dict[str, SearchConfig] = {
         train=TrainConfig(
             env=EnvConfig(physics="closed_form"),
             agent=_LAPTOP_AGENT,
-            num_worlds=4,
-            num_epochs=60,
+            num_worlds=8,
+            num_epochs=40,
             chunk_epochs=2,
         ),
-        population_size=10,
-        num_elites=2,
+        population_size=16,
+        num_elites=3,
         num_stages=2,
-        fitness_epochs=15,
-        num_finalists=2,
-        final_epochs=128,
+        fitness_epochs=10,
+        num_finalists=4,
+        final_epochs=64,
         **_GUIDED,
     ),
     "search": SearchConfig(
         train=TrainConfig(
             env=EnvConfig(physics="closed_form"),
             agent=_LAPTOP_AGENT,
-            num_worlds=4,
-            num_epochs=128,
+            num_worlds=8,
+            num_epochs=64,
             chunk_epochs=4,
         ),
         num_stages=4,
-        fitness_epochs=32,
+        fitness_epochs=16,
         seeds_per_candidate=3,
         num_finalists=10,
         final_seeds=5,
-        final_epochs=512,
+        final_epochs=256,
         **_GUIDED,
     ),
     "paper": SearchConfig(train=TrainConfig(chunk_epochs=3)),

@@ -313,9 +313,6 @@ def _write_stage(
         ),
         "judged": result.fitness.cost,
         "ep_return": result.fitness.ep_return,
-        "floor": result.fitness.floor
-        if result.fitness.floor is not None
-        else np.full(config.population_size, -np.inf, np.float32),
         "order": result.order,
         "frozen": result.frozen,
         "elites": state.es.elites,

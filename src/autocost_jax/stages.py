@@ -21,6 +21,7 @@ from autocost_jax.es import ES, ESState, Fitness, truncation_es
 from autocost_jax.records import Key, Metrics, Slot, TrainingCost
 from autocost_jax.rollout import typical_lidars
 from autocost_jax.starts import graded_start
+from autocost_jax.success import shortfall
 
 # What the fitness and the report are made of, kept for every epoch of a stage.
 TRACKED = (
@@ -31,7 +32,7 @@ TRACKED = (
     "intrinsic_far",
     "intrinsic_near",
 )
-# The costs that candidates are compared with; the first sets the price in return.
+# The costs that candidates are compared with; the first says what success is.
 REFERENCES = {
     "extrinsic": "extrinsic",
     "safety_margin_3x": "extrinsic+safety_margin_3x",
@@ -186,9 +187,9 @@ def stage_result(
 ) -> StageResult:
     """Fitness and scores of a finished stage; a frozen agent costs +inf.
 
-    The cost (or share of violating episodes, see `SearchConfig.judge_by`) and the
-    return of a candidate are the means over its agents. With a
-    `return_share` the floor is that share of what the extrinsic cost alone leaves.
+    A candidate's scores are the means over its seeds. Its return is the mean over the
+    algorithms; so is its cost, or with `judge_by="success"` the share of violating
+    episodes, to which is added how far it is from success, see `success.shortfall`.
 
     Args:
       config: the search.
@@ -209,15 +210,16 @@ def stage_result(
     references = {name: value[:, size:] for name, value in last.items()}
     frozen = jnp.any(dealt.table(frozen)[:, :size], axis=-1)
     broken = jnp.any(frozen, axis=0)
-    ep_return, floor = jnp.mean(scores["ep_return"], axis=0), None
-    if config.return_share > 0:
-        price = config.return_share * jnp.mean(references["ep_return"][:, 0])
-        floor = jnp.broadcast_to(price, ep_return.shape)
-    judged = "ep_cost" if config.judge_by == "cost" else "violating_worlds"
+    if config.judge_by == "cost":
+        cost = jnp.mean(scores["ep_cost"], axis=0)
+    else:
+        names = ("violating_worlds", "ep_return")
+        plain = (references[name][:, 0] for name in names)
+        cost = jnp.mean(scores["violating_worlds"], axis=0)
+        cost += shortfall(*(scores[name] for name in names), *plain)
     fitness = Fitness(
-        cost=jnp.where(broken, jnp.inf, jnp.mean(scores[judged], axis=0)),
-        ep_return=jnp.where(broken, -jnp.inf, ep_return),
-        floor=floor,
+        cost=jnp.where(broken, jnp.inf, cost),
+        ep_return=jnp.where(broken, -jnp.inf, jnp.mean(scores["ep_return"], axis=0)),
     )
     return StageResult(
         candidates=candidates,

@@ -8,9 +8,9 @@ from autocost_jax.costs import HIDDEN, intrinsic_logit
 from autocost_jax.records import Key
 
 QUIET_COST = 1e-4  # where a cost begins to speak
-QUIET_PLACES = (15.0, 50.0)  # percentiles of typical places at which it may begin
+QUIET_PLACES = (5.0, 40.0)  # percentiles of typical places at which it may begin
 LOUD_PLACE = 85.0  # percentile at which its loudness is set
-LOUD_COSTS = (0.01, 0.15)  # how loud it may be there
+LOUD_COSTS = (0.03, 0.4)  # how loud it may be there
 
 
 def graded_start(

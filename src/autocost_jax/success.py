@@ -1,0 +1,42 @@
+"""What counts as success: agents much safer than before, at a bearable price.
+
+A search and its end ask the same of a cost: that agents which learn with it violate far
+less than agents that learn with the extrinsic cost alone, and keep much of their return.
+Both bars are ours.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+# A cost succeeds if it leaves at most this share of the extrinsic cost's violating
+# episodes and at least this share of its return, for every algorithm.
+VIOLATIONS_LEFT = 0.25
+RETURN_KEPT = 0.3
+LEAST = 0.01  # violations and shares of the return are told apart down to here
+
+
+def shortfall(
+    violations: Any, ep_return: Any, plain_violations: Any, plain_return: Any
+) -> jax.Array:
+    """How far costs are from success, 0 for those that reach it.
+
+    It adds up, over the algorithms, log(violations / bar) and log(bar / return) where
+    these are above 0. Unlike a mean over algorithms it lets no algorithm make up for
+    another, and unlike a minimal return it tells a near miss from agents that flee.
+
+    Args:
+      violations: [A, C] share of violating episodes of each algorithm's agents.
+      ep_return: [A, C] their return per episode.
+      plain_violations: [A] the same with the extrinsic cost alone.
+      plain_return: [A] the same.
+
+    Returns:
+      [C]; NaN where any score is.
+    """
+    most = jnp.maximum(VIOLATIONS_LEFT * plain_violations, LEAST)[:, None]
+    least = jnp.maximum(RETURN_KEPT * plain_return, LEAST)[:, None]
+    unsafe = jnp.log(jnp.maximum(violations, LEAST) / most)
+    useless = jnp.log(least / jnp.maximum(ep_return, LEAST * least))
+    return (jnp.maximum(unsafe, 0.0) + jnp.maximum(useless, 0.0)).sum(0)
