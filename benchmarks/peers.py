@@ -20,10 +20,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from autocost_jax import env_config, preset
+from autocost_jax import env_config
 from autocost_jax.bench import Speed, env_speed, slot_speeds
 from autocost_jax.commandline import use_devices
-from autocost_jax.config import Algorithm
+from autocost_jax.config import AgentConfig, Algorithm, TrainConfig
 from autocost_jax.store import run_facts
 
 HERE = Path(__file__).parent
@@ -162,9 +162,14 @@ def measure_ours(case: Case, devices: Sequence[Any]) -> Speed:
     if case.train is None:
         return env_speed(env, BATCH, devices)
     algorithm, passes = case.train
-    train = preset("laptop").train
-    agent = dataclasses.replace(train.agent, value_passes=passes)
-    train = dataclasses.replace(train, env=env, agent=agent, num_worlds=8)
+    agent = AgentConfig(
+        hidden_sizes=(64, 64),
+        policy_passes=6,
+        policy_minibatches=8,
+        value_passes=passes,
+        value_minibatches=8,
+    )
+    train = TrainConfig(env=env, agent=agent, num_worlds=8)
     return slot_speeds(train, algorithm, (SLOTS,), devices)[0]
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Options, compact, run_if_needed, run_part, t_interval
+from common import REDUCED, Options, compact, run_if_needed, run_part, t_interval
 
 from autocost_jax import TrainConfig, env_config, preset
 from autocost_jax.methods import Method, TableConfig
@@ -53,9 +53,11 @@ def folder(options: Options, name: str) -> Path:
 
 
 def variant(name: str, smoke: bool) -> TrainConfig:
-    """The `laptop` update, 8000 steps an epoch, with what the variant changes."""
+    """The reduced learner, 8000 steps an epoch, with what the variant changes."""
     env_changes, train_changes, agent_changes = VARIANTS[name]
-    train = preset("smoke" if smoke else "laptop").train
+    train = TrainConfig(agent=REDUCED, num_worlds=8)
+    if smoke:
+        train = preset("smoke").train
     env = dataclasses.replace(env_config("Goal-Hazard-Point"), physics="closed_form")
     if smoke:
         env = dataclasses.replace(env, num_steps=50)
@@ -79,7 +81,7 @@ def collect(options: Options) -> None:
     result = {
         "command": "python experiments/agreement.py run",
         "facts": run_facts(),
-        "update": "laptop preset: nets 64-64, 6 passes x 8 minibatches (reduced scale)",
+        "update": "nets 64-64, 6 passes x 8 minibatches (reduced scale)",
         "variants": {name: collect_variant(folder(options, name)) for name in done},
     }
     result["differences"] = {

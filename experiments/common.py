@@ -11,9 +11,20 @@ import jax
 import numpy as np
 
 from autocost_jax.commandline import use_devices
+from autocost_jax.config import AgentConfig
 from autocost_jax.methods import TableConfig, run_table
 from autocost_jax.rundata import first_difference
 from autocost_jax.store import read_config
+
+# The learner of what is trained at reduced scale: smaller networks than the paper's,
+# minibatches in place of 80 full-batch steps, everything else as in the paper.
+REDUCED = AgentConfig(
+    hidden_sizes=(64, 64),
+    policy_passes=6,
+    policy_minibatches=8,
+    value_passes=6,
+    value_minibatches=8,
+)
 
 
 class Options(NamedTuple):

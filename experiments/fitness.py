@@ -17,6 +17,7 @@ beside them as references.
 """
 
 import argparse
+import dataclasses
 import itertools
 import json
 import time
@@ -26,7 +27,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import compact
+from common import REDUCED, compact
 
 from autocost_jax.agents.base import actor
 from autocost_jax.arrays import flatten
@@ -36,7 +37,6 @@ from autocost_jax.costs import training_cost
 from autocost_jax.envs.env import Env, make_env
 from autocost_jax.evaluate import evaluate
 from autocost_jax.population import Population, make_agents, make_population
-from autocost_jax.presets import preset
 from autocost_jax.records import Slot
 from autocost_jax.rollout import typical_lidars
 from autocost_jax.starts import graded_start
@@ -347,7 +347,7 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     use_devices(None)
     env = EnvConfig(physics="closed_form", num_steps=100 if args.smoke else 1000)
-    agent = preset("laptop").train.agent
+    agent = dataclasses.replace(REDUCED, normalize_obs=True)
     config = TrainConfig(env=env, agent=agent, num_worlds=4, num_epochs=1)
     run(args.out, SMOKE if args.smoke else Size(), config, args.seconds)
 

@@ -22,11 +22,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from common import compact, t_interval
+from common import REDUCED, compact, t_interval
 
 from autocost_jax.agents.base import actor
 from autocost_jax.commandline import use_devices
-from autocost_jax.config import AgentConfig, EnvConfig, TrainConfig
+from autocost_jax.config import EnvConfig, TrainConfig
 from autocost_jax.envs.env import make_env
 from autocost_jax.evaluate import evaluate
 from autocost_jax.methods import Method, TableConfig, table_slots
@@ -36,16 +36,9 @@ from autocost_jax.store import run_facts
 
 STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
 COSTS = ("extrinsic", "extrinsic+safety_margin_2x", "extrinsic+safety_margin_3x")
-BASE: dict[str, Any] = {
-    "hidden_sizes": (64, 64),
-    "policy_passes": 6,
-    "policy_minibatches": 8,
-    "value_passes": 6,
-    "value_minibatches": 8,
-}
 NORM = {"normalize_obs": True}
 FAST = NORM | {"target_kl": 0.02, "multiplier_lr": 0.02}
-# name -> worlds an epoch, segments per episode, agent settings that differ from BASE
+# name -> worlds an epoch, segments per episode, agent settings that differ from REDUCED
 SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "as before": (8, 1, {}),
     "normalised": (8, 1, NORM),
@@ -65,7 +58,7 @@ def config_of(name: str, steps: int = STEPS, episode: int = 1000) -> TableConfig
     worlds, segments, changes = SETTINGS[name]
     train = TrainConfig(
         env=EnvConfig(physics="closed_form", num_steps=episode),
-        agent=AgentConfig(**(BASE | changes)),
+        agent=dataclasses.replace(REDUCED, **changes),
         num_worlds=worlds,
         segments_per_episode=segments,
         num_epochs=max(1, steps // (worlds * episode)),

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import compact, run_if_needed
+from common import REDUCED, compact, run_if_needed
 
 from autocost_jax import TrainConfig, env_config, load_cost, preset
 from autocost_jax.commandline import use_compile_cache, use_devices
@@ -128,13 +128,12 @@ class Scale(NamedTuple):
 
 
 def scales(world: str = WORLD) -> dict[str, Scale]:
-    """`reduced`: the laptop's networks and minibatches, observations as they are.
+    """`reduced`: smaller networks and minibatches, see `REDUCED`.
 
     512,000 steps a slot, fewer in slow worlds; `reduced_2m` is four times as long.
     `reduced_10m` has the paper's 333 epochs of 30 worlds, 9,990,000 steps a slot.
     """
     smoke = preset("smoke").train
-    plain = dataclasses.replace(preset("laptop").train.agent, normalize_obs=False)
     slow = {
         "Goal-Pillar-Point": (4, 64, 200),
         "Push-Hazard-Point": (4, 32, 50),
@@ -143,9 +142,9 @@ def scales(world: str = WORLD) -> dict[str, Scale]:
         in_world("Goal-Hazard-Doggo", world): (4, 64, 50),
     }
     slow_2m = {name: (n, 4 * t, episodes) for name, (n, t, episodes) in slow.items()}
-    reduced = TrainConfig(agent=plain, num_worlds=8, num_epochs=64, chunk_epochs=4)
+    reduced = TrainConfig(agent=REDUCED, num_worlds=8, num_epochs=64, chunk_epochs=4)
     longer = dataclasses.replace(reduced, num_epochs=256)
-    longest = TrainConfig(agent=plain, num_worlds=30, num_epochs=333, chunk_epochs=37)
+    longest = TrainConfig(agent=REDUCED, num_worlds=30, num_epochs=333, chunk_epochs=37)
     known = (
         Scale("reduced", reduced, sizes=slow),
         Scale("reduced_2m", longer, sizes=slow_2m),

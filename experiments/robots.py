@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import Options, compact, run_if_needed, run_part, t_interval
+from common import REDUCED, Options, compact, run_if_needed, run_part, t_interval
 from robots_tables import ALGORITHMS, draw, render
 
 from autocost_jax import Agent, EnvConfig, TrainConfig, env_config, make_env, preset
@@ -133,13 +133,11 @@ def chosen(sizes: dict[str, Any], options: Options) -> dict[str, Any]:
 
 
 def sized(env: EnvConfig, worlds: int, epochs: int, options: Options) -> TrainConfig:
-    """The `laptop` update in one world, or the `smoke` one."""
+    """The reduced learner in one world, or the `smoke` preset's."""
     if options.smoke:
         env = dataclasses.replace(env, num_steps=50)
         return dataclasses.replace(preset("smoke").train, env=env)
-    return dataclasses.replace(
-        preset("laptop").train, env=env, num_worlds=worlds, num_epochs=epochs
-    )
+    return TrainConfig(env=env, agent=REDUCED, num_worlds=worlds, num_epochs=epochs)
 
 
 def evaluate_random(config: TableConfig, num_episodes: int) -> list[dict[str, Any]]:
@@ -285,7 +283,7 @@ def collect(options: Options) -> None:
     result: dict[str, Any] = {
         "commands": [f"python experiments/robots.py {part}" for part in PARTS],
         "facts": run_facts(),
-        "update": "laptop preset: nets 64-64, 6 passes x 8 minibatches (reduced scale)",
+        "update": "nets 64-64, 6 passes x 8 minibatches (reduced scale)",
         "runs": {},
         "beats_random": {},
         "limit25": {},

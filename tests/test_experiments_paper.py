@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax import preset
 from autocost_jax.costs import total_cost
 from autocost_jax.env_config import ENVS
 from autocost_jax.records import CostInputs
@@ -84,8 +83,7 @@ def test_the_longest_reduced_scale_has_the_steps_of_the_paper():
     ]
     assert paper.steps_a_slot(trains[0]) == paper.steps_a_slot(trains[1]) == 9_990_000
     assert trains[0].num_worlds == trains[1].num_worlds == 30
-    agent = preset("search").train.agent  # smaller
-    assert trains[0].agent == dataclasses.replace(agent, normalize_obs=False)
+    assert trains[0].agent == common.REDUCED
 
 
 def test_designs_are_those_whose_costs_were_found_in_the_world():

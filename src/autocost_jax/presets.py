@@ -14,7 +14,7 @@ _LAPTOP_AGENT = AgentConfig(
     policy_minibatches=8,
     value_passes=4,
     value_minibatches=8,
-    multiplier_lr=0.02,
+    multiplier_lr=0.01,
     cg_iterations=5,
 )
 
@@ -37,15 +37,15 @@ PRESETS: dict[str, SearchConfig] = {
             env=EnvConfig(physics="closed_form"),
             agent=_LAPTOP_AGENT,
             num_worlds=8,
-            num_epochs=40,
+            num_epochs=48,
             chunk_epochs=2,
         ),
         population_size=16,
         num_elites=3,
         num_stages=2,
-        fitness_epochs=10,
+        fitness_epochs=12,
         num_finalists=4,
-        final_epochs=64,
+        final_epochs=80,
         **_GUIDED,
     ),
     "search": SearchConfig(
