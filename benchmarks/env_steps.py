@@ -35,7 +35,7 @@ def measure(name: str, batch: int, devices: Any) -> dict[str, Any]:
 
 
 def render(result: dict[str, Any]) -> str:
-    """The table of the README."""
+    """The table of docs/performance.md."""
     rates = {
         (row["name"], row["worlds"]): f"{row['env_steps_per_second']:,}"
         for row in result["rows"]

@@ -174,7 +174,7 @@ def measure_ours(case: Case, devices: Sequence[Any]) -> Speed:
 
 
 def render(result: dict[str, Any]) -> str:
-    """The table of the README."""
+    """The table of docs/performance.md."""
     lines = [
         "| peer | env steps/s | here | env steps/s | ratio |",
         "|---|---|---|---|---|",

@@ -38,7 +38,7 @@ PARTS = ("mjx", "closed_form", "slots", "devices", "compile", "update")
 
 
 def render(result: dict[str, Any]) -> str:
-    """The tables of the README, a part each."""
+    """The tables of docs/performance.md, a part each."""
     parts = result["parts"]
     rows = [row for part in PARTS[:4] for row in parts.get(part, {}).get("rows", ())]
     lines = []

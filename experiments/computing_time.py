@@ -107,7 +107,7 @@ def on_a_gpu(file: Path) -> dict[str, Any] | None:
 
 
 def render(result: dict[str, Any]) -> str:
-    """The table of the README."""
+    """The table of the page of the experiments."""
     lines = [
         "| world | paper, hours | one PPO-Lag agent | one CPO agent | of it rollout |",
         "|---|---|---|---|---|",

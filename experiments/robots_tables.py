@@ -11,7 +11,7 @@ ROBOTS = ("Point", "Car", "Doggo")
 
 
 def render(result: dict[str, Any]) -> str:
-    """The tables of the README, from the JSON."""
+    """The tables of docs/training.md, from the JSON."""
     parts = [
         render_runs(result["runs"]) if result["runs"] else [],
         render_random(result["beats_random"]) if result["beats_random"] else [],

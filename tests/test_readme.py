@@ -1,4 +1,4 @@
-"""What the README says is so."""
+"""What the README and the documents say is so."""
 
 import json
 import re
@@ -15,11 +15,16 @@ from scripts import load_script
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+DOCS = {page.stem: page.read_text() for page in (ROOT / "docs").glob("*.md")}
 
 
-def table_row(first_cell: str) -> str:
-    (row,) = re.findall(rf"^\| {re.escape(first_cell)} \|(.*)\|$", README, re.M)
+def table_row(page: str, first_cell: str) -> str:
+    (row,) = re.findall(rf"^\| {re.escape(first_cell)} \|(.*)\|$", DOCS[page], re.M)
     return row.strip()
+
+
+def test_the_readme_is_short():
+    assert len(README.splitlines()) <= 150
 
 
 def test_the_python_example_runs(capsys):
@@ -36,7 +41,7 @@ def test_the_python_example_runs(capsys):
 @pytest.mark.parametrize("name", ["laptop (default)", "search", "paper", "smoke"])
 def test_the_preset_table_is_the_presets(name):
     key = f"`{name.split()[0]}`" + (" (default)" if "default" in name else "")
-    row = table_row(key)
+    row = table_row("commands", key)
     config = preset(name.split()[0])
     agent = config.train.agent
     words = [
@@ -66,26 +71,26 @@ def test_the_table_of_the_worlds_is_that_of_the_configurations():
         assert config.lidar_max_dist is None  # exponential
         assert config.num_steps == 1000
         assert not config.constrain_indicator
-    assert table_row("extents") == "2 m"
+    assert table_row("worlds", "extents") == "2 m"
     crowded = env_config("Goal-Hazard8-Point")
     assert push.hazards_num == goal.hazards_num
-    assert table_row("hazards") == (
+    assert table_row("worlds", "hazards") == (
         f"{goal.hazards_num} (`Goal-Hazard8-*`: {crowded.hazards_num}), "
         f"radius {goal.hazards_size} m, keepout {goal.hazards_keepout} m"
     )
-    assert table_row("pillars") == (
+    assert table_row("worlds", "pillars") == (
         f"{pillars.pillars_num}, radius {pillars.pillars_size} m, "
         f"keepout {pillars.pillars_keepout} m"
     )
-    assert table_row("goal") == (
+    assert table_row("worlds", "goal") == (
         f"radius {goal.goal_size} m, keepout {goal.goal_keepout} m"
     )
-    assert table_row("box") == (
+    assert table_row("worlds", "box") == (
         f"half-width {push.box_size} m, keepout {push.box_keepout} m "
         f"(Car: {car.box_size} m, {car.box_keepout} m)"
     )
-    assert table_row("robot keepout") == f"{goal.robot_keepout} m"
-    assert table_row("lidars") == (
+    assert table_row("worlds", "robot keepout") == f"{goal.robot_keepout} m"
+    assert table_row("worlds", "lidars") == (
         f"{goal.lidar_num_bins} bins, exponential, gain {goal.lidar_exp_gain:g}"
     )
     periods = []
@@ -93,7 +98,7 @@ def test_the_table_of_the_worlds_is_that_of_the_configurations():
         model = scene_model(env_config(f"Goal-Hazard-{robot}"))
         period = model.opt.timestep * goal.frameskip_binom_n
         periods.append(f"{period:g} s ({robot})")
-    assert table_row("episode") == f"1000 steps of {', '.join(periods)}"
+    assert table_row("worlds", "episode") == f"1000 steps of {', '.join(periods)}"
 
 
 def test_ci_runs_the_test_command_of_the_readme():
@@ -132,14 +137,36 @@ def test_the_wheel_would_hold_everything_that_is_read_at_run_time():
     ],
 )
 def test_the_tables_are_those_of_the_committed_json(script, result):
-    expect = load_script(script).render(
-        json.loads((ROOT / f"{result}.json").read_text())
-    )
-    assert len(expect.splitlines()) > 2
-    (shown,) = re.findall(
-        rf"<!-- {Path(result).name}\.md -->\n(.*?)<!-- end -->", README, re.DOTALL
-    )
-    assert shown.strip() == expect.strip()
+    text = load_script(script).render(json.loads((ROOT / f"{result}.json").read_text()))
+    assert len(text.splitlines()) > 2
+    assert (ROOT / f"{result}.md").read_text().strip() == text.strip()
+    assert any(f'--8<-- "{result}.md"' in page for page in DOCS.values())
+
+
+def test_what_the_documents_include_exists():
+    included = re.findall(r'^--8<-- "(.*)"$', "\n".join(DOCS.values()), re.M)
+    assert len(included) >= 6
+    for file in included:
+        assert (ROOT / file).exists(), file
+
+
+def test_the_speeds_of_the_readme_are_measured_ones():
+    section = README.split("## How fast it is")[1].split("##")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| ")]
+    assert len(rows) > 4
+    measured = (ROOT / "benchmarks" / "results" / "peers.md").read_text().splitlines()
+    assert set(rows) <= set(measured)
+
+
+def test_the_results_of_the_readme_are_those_of_the_main_job():
+    file = ROOT / "experiments" / "results" / "laptop" / "main_job.json"
+    result = json.loads(file.read_text())
+    for seed, best in zip(result["seeds"], result["best"], strict=True):
+        cells = [
+            f"{row['return']:.1f} at {row['violation_rate']:.0%}"
+            for row in best["rows"]
+        ]
+        assert f"| {seed} | {' | '.join(cells)} |" in README
 
 
 @pytest.mark.parametrize(
@@ -154,7 +181,7 @@ def test_the_tables_are_those_of_the_committed_json(script, result):
         "--num-processes",
         "--process-id",
         "--start",
-        "--return-share",
+        "--judge-by",
         "--seeds-per-candidate",
         "--pool-scores",
         "--references",
@@ -163,8 +190,8 @@ def test_the_tables_are_those_of_the_committed_json(script, result):
         "--network",
     ],
 )
-def test_flags_of_the_readme_exist(flag, capsys):
+def test_flags_of_the_documents_exist(flag, capsys):
     with pytest.raises(SystemExit):
         evolve_main(["--help"])
-    assert flag in README
+    assert any(flag in page for page in DOCS.values())
     assert flag in capsys.readouterr().out

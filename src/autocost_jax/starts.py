@@ -8,9 +8,10 @@ from autocost_jax.costs import HIDDEN, intrinsic_logit
 from autocost_jax.records import Key
 
 QUIET_COST = 1e-4  # where a cost begins to speak
-QUIET_PLACES = (5.0, 40.0)  # percentiles of typical places at which it may begin
+QUIET_PLACES = (5.0, 30.0)  # percentiles of typical places at which it may begin
 LOUD_PLACE = 85.0  # percentile at which its loudness is set
-LOUD_COSTS = (0.03, 0.4)  # how loud it may be there
+LOUD_COSTS = (0.05, 0.8)  # how loud it may be there
+UNEVEN = 0.25  # relative deviation of a unit's weights: how much directions differ
 
 
 def graded_start(
@@ -24,11 +25,12 @@ def graded_start(
 ) -> jax.Array:
     """Random costs that rise as anything comes nearer; ours, not the paper's start.
 
-    Weights are |N(0, std^2)|, and each hidden unit turns on where one of the typical
-    places has its readings. The output layer is scaled so that over all these places
-    the cost is 1e-4 at a percentile uniform in `quiet_places` (how far it reaches) and
-    log-uniform in `loud_costs` at the 85th (how loud it is): most of what N(0, std^2)
-    draws is silent everywhere or so loud that agents flee, whatever its shape.
+    A hidden unit weighs all directions alike but for 25 % and turns on where one of the
+    typical places has its readings; the output weights are |N(0, std^2)|. The output
+    layer is scaled so that over all these places the cost is 1e-4 at a percentile
+    uniform in `quiet_places` (how far it reaches) and log-uniform in `loud_costs` at
+    the 85th (how loud it is). Most of what N(0, std^2) draws is silent everywhere, or
+    so loud that agents flee, or deaf in some direction.
 
     Args:
       key: consumed.
@@ -64,11 +66,12 @@ def graded_start(
 def _random_parts(
     key: Key, num: int, std: float, network: CostNetwork
 ) -> tuple[jax.Array, jax.Array]:
-    """|W1| [P, rows, 4] and |W2| [P, 4] of N(0, std^2)."""
-    theta = std * jax.random.normal(key, (num, THETA_SIZES[network]), jnp.float32)
-    split = theta.shape[1] - 1 - 2 * HIDDEN
-    inner, _, outer = jnp.split(theta[:, :-1], (split, split + HIDDEN), axis=1)
-    return jnp.abs(inner).reshape(num, -1, HIDDEN), jnp.abs(outer)
+    """W1 [P, rows, 4] of about the mean of |N(0, std^2)|, and |W2| [P, 4] of it."""
+    key_inner, key_outer = jax.random.split(key)
+    rows = (THETA_SIZES[network] - 1 - 2 * HIDDEN) // HIDDEN
+    uneven = UNEVEN * jax.random.normal(key_inner, (num, rows, HIDDEN))
+    outer = jax.random.normal(key_outer, (num, HIDDEN))
+    return 0.8 * std * jnp.abs(1.0 + uneven), std * jnp.abs(outer)
 
 
 def _join_parts(

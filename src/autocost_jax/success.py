@@ -1,8 +1,8 @@
 """What counts as success: agents much safer than before, at a bearable price.
 
 A search and its end ask the same of a cost: agents that learn with it violate far less
-than agents that learn with the extrinsic cost alone, and keep much of their return. Both
-bars are ours.
+than agents that learn with the extrinsic cost alone, and keep much of their return.
+Both bars are ours.
 """
 
 from typing import Any
