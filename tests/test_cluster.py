@@ -80,6 +80,7 @@ def both(tmp_path_factory, environment):
     return out, said
 
 
+@pytest.mark.slow
 def test_only_the_first_process_speaks_and_writes(both):
     out, (first, second) = both
     assert "open " in first
@@ -89,6 +90,7 @@ def test_only_the_first_process_speaks_and_writes(both):
     assert len(read_metrics(out)) == 6  # one row an epoch, not two
 
 
+@pytest.mark.slow
 def test_it_is_the_search_of_one_process(both, environment, tmp_path):
     """The same slots on two devices of one process; sums in the same order."""
     process = start(tmp_path / "one", environment, *FLAGS, "--devices", "2")
@@ -104,6 +106,7 @@ def test_it_is_the_search_of_one_process(both, environment, tmp_path):
             )
 
 
+@pytest.mark.slow
 def test_a_crash_ends_the_others_and_one_process_can_go_on(environment, tmp_path):
     """In one line and soon; then the run is resumed on another number of devices."""
     out = tmp_path / "crashed"
@@ -140,6 +143,7 @@ def test_a_lost_peer_is_no_bad_input(kind, capsys):
     assert capsys.readouterr().err.startswith("prog: UNKNOWN: Gloo")
 
 
+@pytest.mark.slow
 def test_a_table_in_two_processes_is_that_of_one(environment, tmp_path):
     """`autocost train`: the same numbers, written once; resumed in the middle."""
     flags = ["--preset", "smoke", "--physics", "closed_form", "--num-seeds", "2"]

@@ -51,6 +51,13 @@ def selected(fitness, num_elites=2, **options):
     return index.tolist()
 
 
+@pytest.fixture(scope="module")
+def places():
+    """Readings [256, 8] at typical places."""
+    env = make_env("Goal-Hazard-Point")
+    return jax.jit(lambda key: typical_lidars(env, key, 256))(jax.random.key(1))
+
+
 jit_mutate = jax.jit(mutate, static_argnums=2)
 
 
@@ -150,8 +157,7 @@ def test_a_lucky_retraining_is_no_zero_violation(key):
 
 
 @pytest.mark.parametrize("network", ["dense", "nearest"])
-def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network):
-    places = typical_lidars(make_env("Goal-Hazard-Point"), jax.random.key(1), 256)
+def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network, places):
     theta = graded_start(key, 200, 8.0, places, network)
     costs = np.asarray(jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta))
     quiet = 100 * (costs < QUIET_COST).mean(1)
@@ -168,8 +174,7 @@ def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network):
     assert bool((nearer >= costs).all())
 
 
-def test_a_graded_start_keeps_to_other_ranges(key):
-    places = typical_lidars(make_env("Goal-Hazard-Point"), jax.random.key(1), 256)
+def test_a_graded_start_keeps_to_other_ranges(key, places):
     theta = graded_start(
         key, 50, 8.0, places, quiet_places=(60.0, 70.0), loud_costs=(0.4, 0.5)
     )
@@ -184,8 +189,9 @@ def test_a_search_hands_its_world_to_its_start(key):
     config = preset("smoke")
     sizes = {"population_size": 12, "num_elites": 2, "num_finalists": 0}
     es = make_strategy(dataclasses.replace(config, start="graded", **sizes))
-    first = es.ask(key, es.init())
-    places = typical_lidars(make_env(config.train.env), jax.random.key(0))
+    first = jax.jit(es.ask)(key, es.init())
+    env = make_env(config.train.env)
+    places = jax.jit(lambda key: typical_lidars(env, key))(jax.random.key(0))
     costs = jax.vmap(lambda theta: intrinsic_cost(theta, places))
     quiet = 100 * np.mean(np.asarray(costs(first)) < QUIET_COST, axis=1)
     assert quiet.min() > QUIET_PLACES[0] - 1

@@ -339,6 +339,7 @@ def test_a_shape_costs_what_its_name_says():
     assert len(set(shapes.TRIED)) == len(shapes.TRIED) == 29
 
 
+@pytest.mark.slow
 def test_shapes_from_training_to_picture(tmp_path):
     """In two goes; what is trained is not trained again."""
     words = ["--smoke", "--runs", str(tmp_path / "runs"), "--results", str(tmp_path)]
@@ -379,6 +380,7 @@ def test_fresh_scores_stand_beside_the_shapes(tmp_path):
     assert shapes.fresh_scores(tmp_path / "none.json", "Goal-Hazard-Point", "cpo") == []
 
 
+@pytest.mark.slow
 def test_one_figure_from_training_to_picture(tmp_path):
     words = ["--smoke", "--runs", str(tmp_path / "runs"), "--results", str(tmp_path)]
     for part in ("run", "run", "collect"):  # the second finds everything done

@@ -10,13 +10,12 @@ import numpy as np
 
 from autocost_jax.agents.base import actor
 from autocost_jax.arrays import load_arrays, unflatten
-from autocost_jax.config import TrainConfig
+from autocost_jax.config import AgentConfig, TrainConfig
 from autocost_jax.costs import load_cost
 from autocost_jax.env_config import env_config
 from autocost_jax.envs.env import make_env
 from autocost_jax.policies import policy_states
 from autocost_jax.population import make_agents, make_evaluator
-from autocost_jax.presets import preset
 from autocost_jax.report import network_cost, write_comparison
 from autocost_jax.scene import first_recording, make_replay, watch_first
 
@@ -39,9 +38,10 @@ class Demo(NamedTuple):
 
 def demo_train() -> TrainConfig:
     """The world and networks that the shipped policies were trained with."""
-    train = preset("laptop").train
-    env = dataclasses.replace(env_config(WORLD), physics="closed_form")
-    return dataclasses.replace(train, env=env)
+    return TrainConfig(
+        env=dataclasses.replace(env_config(WORLD), physics="closed_form"),
+        agent=AgentConfig(hidden_sizes=(64, 64), normalize_obs=True),
+    )
 
 
 def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
