@@ -31,13 +31,19 @@ from autocost_jax.envs.env import make_env
 from autocost_jax.evaluate import evaluate
 from autocost_jax.methods import Method, TableConfig, table_slots
 from autocost_jax.population import make_agents, make_population
-from autocost_jax.presets import preset
 from autocost_jax.store import run_facts
 
 STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
 COSTS = ("extrinsic", "extrinsic+safety_margin_2x", "extrinsic+safety_margin_3x")
 NORM = {"normalize_obs": True}
-PRESET = dataclasses.asdict(preset("laptop").train.agent)
+SMALL: dict[str, Any] = {  # with the last line of SETTINGS the `laptop` preset
+    "normalize_obs": True,
+    "hidden_sizes": (32, 32),
+    "target_kl": 0.02,
+    "policy_passes": 4,
+    "value_passes": 4,
+    "cg_iterations": 5,
+}
 # name -> worlds an epoch, segments per episode, agent settings that differ from REDUCED
 SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "as before": (8, 1, {}),
@@ -45,8 +51,12 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "4 worlds": (4, 1, NORM),
     "4 worlds, multiplier lr 0.02": (4, 1, NORM | {"multiplier_lr": 0.02}),
     "4 worlds in 4 cohorts": (4, 4, NORM),
-    "the preset, multiplier lr 0.02": (8, 1, PRESET | {"multiplier_lr": 0.02}),
-    "the preset": (8, 1, PRESET),
+    "32-32, multiplier from 1 at 0.02": (8, 1, SMALL | {"multiplier_lr": 0.02}),
+    "32-32, multiplier from 0.5 at 0.01": (
+        8,
+        1,
+        SMALL | {"multiplier_init": 0.5, "multiplier_lr": 0.01},
+    ),
 }
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 

@@ -33,6 +33,7 @@ ORDER = (
     "train",
     "evaluate",
     "es",
+    "success",
     "starts",
     "population",
     "stages",

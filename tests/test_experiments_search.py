@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from autocost_jax.presets import preset
 from scripts import load_script
 
 RESULTS = Path(__file__).parents[1] / "experiments" / "results"
@@ -26,6 +27,14 @@ def test_tables_are_those_of_the_committed_json(script, folder, rows):
     text = load_script(f"experiments/{script}").table(result[rows] if rows else result)
     assert len(text.splitlines()) > 4
     assert file.with_suffix(".md").read_text() == text
+
+
+def test_the_last_learner_setting_is_that_of_the_laptop_preset():
+    learners = load_script("experiments/learners")
+    train = learners.config_of(list(learners.SETTINGS)[-1]).train
+    laptop = preset("laptop").train
+    assert train.agent == laptop.agent
+    assert train.num_worlds == laptop.num_worlds
 
 
 def test_the_interval_of_a_fall():
