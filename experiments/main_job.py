@@ -16,6 +16,7 @@ or more, for each algorithm.
 """
 
 import argparse
+import dataclasses
 import json
 import subprocess
 import sys
@@ -25,10 +26,9 @@ from typing import Any
 import numpy as np
 
 from autocost_jax.arrays import load_arrays
-from autocost_jax.outcome import row_of
+from autocost_jax.outcome import reaches_bars, row_of
 from autocost_jax.rundata import read_document, to_json
 from autocost_jax.store import list_stages, read_config
-from autocost_jax.success import RETURN_KEPT, VIOLATIONS_LEFT
 
 SEEDS = (0, 1, 2)
 WORDS = {True: "yes", False: "no", None: "not measured"}
@@ -116,7 +116,7 @@ def best_row(path: Path) -> dict[str, Any]:
         out[name] = {
             "violations_left": safe,
             "return_kept": kept,
-            "reached": safe <= VIOLATIONS_LEFT and kept >= RETURN_KEPT,
+            "reached": reaches_bars(rows, name),
         }
     return out
 
@@ -217,6 +217,15 @@ def figure(result: dict[str, Any], runs: Path, path: Path) -> None:
     fig.savefig(path, dpi=80)
 
 
+def require_same_job(paths: list[Path]) -> None:
+    """Refuse runs of another preset that an earlier version left behind."""
+    common = {"seed": 0, "selection": "paper", "num_finalists": 0}
+    configs = [dataclasses.replace(read_config(path)[0], **common) for path in paths]
+    for path, config in zip(paths, configs, strict=True):
+        if config != configs[0]:
+            raise SystemExit(f"{path} is not a run of the job of {paths[0]}")
+
+
 def collect(runs: Path, results: Path) -> None:
     """JSON, table and figure of all runs."""
     seeds = [
@@ -226,6 +235,7 @@ def collect(runs: Path, results: Path) -> None:
     ]
     papers = [search_dir(runs, "paper", seed) for seed in seeds]
     controls = [search_dir(runs, "random", seed) for seed in seeds]
+    require_same_job([path for path in (*papers, *controls) if path.exists()])
     result = {
         "command": "python experiments/main_job.py run && "
         "python experiments/main_job.py collect",

@@ -459,9 +459,9 @@ def render(result: dict[str, Any]) -> str:
 
 
 AXES = {
-    "ep_return": "return an episode",
-    "ep_cost": "extrinsic cost an episode",
-    "ep_total_cost": "training cost an episode",
+    "ep_return": "return per episode",
+    "ep_cost": "extrinsic cost per episode",
+    "ep_total_cost": "training cost per episode",
 }
 
 

@@ -139,8 +139,8 @@ def draw_runs(runs: dict[str, Any], file: Path) -> None:
         band(axes[1, column], run, "ep_cost")
         axes[0, column].set_title(f"{name}, {run['worlds']} worlds", fontsize=9)
         axes[1, column].set(xlabel="epoch", ylim=(0, None))
-    axes[0, 0].set_ylabel("return an episode")
-    axes[1, 0].set_ylabel("extrinsic cost an episode")
+    axes[0, 0].set_ylabel("return per episode")
+    axes[1, 0].set_ylabel("extrinsic cost per episode")
     axes[0, 0].legend(fontsize=8)
     figure.savefig(file, dpi=150)
 
@@ -196,7 +196,7 @@ def draw_limit(tables: dict[str, Any], file: Path) -> None:
         cost.legend(fontsize=8)
     run = tables["limit25"]
     band(axes[1, 0], run, "ep_return")
-    axes[1, 0].set(ylabel="return an episode, first table")
+    axes[1, 0].set(ylabel="return per episode, first table")
     for table in tables.values():
         slots = [slot for slot in table["slots"] if slot["method"] == ALGORITHMS[1]]
         band(axes[1, 1], {"slots": slots}, "multiplier")

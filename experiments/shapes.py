@@ -258,7 +258,7 @@ def draw(result: dict[str, Any], file: Path, margins: Path) -> None:
                 label=f"{paper.DESIGNS[design].title} ({score['episodes']} fresh)",
             )
         panel.set_title(paper.NAMES[algorithm], fontsize=9)
-        panel.set_xlabel("return an episode")
+        panel.set_xlabel("return per episode")
         panel.set_yscale("symlog", linthresh=0.2)
         panel.set_ylim(-0.02, 100)
     panels[0].set_ylabel("violating episodes, %")

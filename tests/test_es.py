@@ -174,6 +174,15 @@ def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network, places):
     assert bool((nearer >= costs).all())
 
 
+def test_a_graded_start_hears_all_directions(key, places):
+    """One object close by, in each of the eight directions in turn."""
+    theta = graded_start(key, 200, 8.0, places)
+    near = 0.9 * jnp.eye(8)
+    costs = np.asarray(jax.vmap(lambda theta: intrinsic_cost(theta, near))(theta))
+    heard = costs.min(1) > 0.1 * costs.mean(1)
+    assert heard.mean() > 0.7
+
+
 def test_a_graded_start_keeps_to_other_ranges(key, places):
     theta = graded_start(
         key, 50, 8.0, places, quiet_places=(60.0, 70.0), loud_costs=(0.4, 0.5)

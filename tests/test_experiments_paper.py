@@ -83,7 +83,19 @@ def test_the_longest_reduced_scale_has_the_steps_of_the_paper():
     ]
     assert paper.steps_a_slot(trains[0]) == paper.steps_a_slot(trains[1]) == 9_990_000
     assert trains[0].num_worlds == trains[1].num_worlds == 30
-    assert trains[0].agent == common.REDUCED
+    agent = trains[0].agent  # what all results at reduced scale were trained with
+    assert (agent.hidden_sizes, agent.normalize_obs) == ((64, 64), False)
+    assert (agent.policy_passes, agent.policy_minibatches) == (6, 8)
+    assert (agent.value_passes, agent.value_minibatches) == (6, 8)
+    paper_agent = dataclasses.replace(
+        trains[1].agent,
+        hidden_sizes=(64, 64),
+        policy_passes=6,
+        policy_minibatches=8,
+        value_passes=6,
+        value_minibatches=8,
+    )
+    assert agent == paper_agent
 
 
 def test_designs_are_those_whose_costs_were_found_in_the_world():

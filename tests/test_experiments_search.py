@@ -1,5 +1,6 @@
 """Experiments on the search: their tables are those of their JSON, their statistics."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from autocost_jax.costs import load_cost
 from autocost_jax.presets import preset
 from scripts import load_script
 
@@ -29,12 +31,34 @@ def test_tables_are_those_of_the_committed_json(script, folder, rows):
     assert file.with_suffix(".md").read_text() == text
 
 
-def test_the_last_learner_setting_is_that_of_the_laptop_preset():
+def test_measured_learners_are_those_of_the_script():
+    """A setting that has been measured does not change with a preset."""
     learners = load_script("experiments/learners")
-    train = learners.config_of(list(learners.SETTINGS)[-1]).train
+    result = json.loads((RESULTS / "learners" / "learners.json").read_text())
+    assert len(result["settings"]) >= 5
+    for measured in result["settings"]:
+        train = learners.config_of(measured["setting"]).train
+        agent = dataclasses.asdict(train.agent)
+        known = {name: measured["agent"][name] for name in agent}
+        assert known == json.loads(json.dumps(agent))
+        assert measured["worlds"] == train.num_worlds
+
+
+def test_a_learner_setting_is_that_of_the_laptop_preset():
+    learners = load_script("experiments/learners")
+    trains = [learners.config_of(name).train for name in learners.SETTINGS]
+    settings = [(train.agent, train.num_worlds) for train in trains]
     laptop = preset("laptop").train
-    assert train.agent == laptop.agent
-    assert train.num_worlds == laptop.num_worlds
+    assert (laptop.agent, laptop.num_worlds) in settings
+
+
+def test_the_shipped_cost_is_one_of_the_study():
+    fitness = load_script("experiments/fitness")
+    theta = fitness.costs(fitness.Size())
+    assert theta.shape == (48, 41)
+    assert not theta[:2].any()
+    np.testing.assert_allclose(theta[36], load_cost("lidar_mlp"), rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(fitness.costs(fitness.SMOKE)[[2, 4]], theta[[2, 42]])
 
 
 def test_the_interval_of_a_fall():

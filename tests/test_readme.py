@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 
 from autocost_jax import env_config, preset
+from autocost_jax.cli import HELP
 from autocost_jax.env_config import ENVS
 from autocost_jax.envs.models import scene_model
 from autocost_jax.evolve import main as evolve_main
+from autocost_jax.starts import LOUD_COSTS, QUIET_PLACES
 from scripts import load_script
 
 ROOT = Path(__file__).parents[1]
@@ -21,6 +23,21 @@ DOCS = {page.stem: page.read_text() for page in (ROOT / "docs").glob("*.md")}
 def table_row(page: str, first_cell: str) -> str:
     (row,) = re.findall(rf"^\| {re.escape(first_cell)} \|(.*)\|$", DOCS[page], re.M)
     return row.strip()
+
+
+def test_the_start_is_as_the_documents_say():
+    row = table_row("search", "start of theta")
+    low, high = QUIET_PLACES
+    assert f"from {low:g} to {high:g}," in row
+    low, high = LOUD_COSTS
+    assert f"from {low:g} to {high:g} (log-uniform)" in row
+
+
+def test_every_command_is_in_the_documents():
+    commands = re.findall(r"^  (\w+) ", HELP, re.M)
+    assert len(commands) == 8
+    for command in commands:
+        assert re.search(rf"^\| `autocost {command}\b", DOCS["commands"], re.M), command
 
 
 def test_the_readme_is_short():
@@ -52,6 +69,8 @@ def test_the_preset_table_is_the_presets(name):
         f"{config.train.num_epochs} epochs",
         f"{config.num_stages} stages",
     ]
+    if config.num_finalists:
+        words.append(f"{config.num_finalists} finalists x {config.final_seeds} seeds")
     if name != "smoke":
         words.append(f"init_std {config.init_std:g}")
         words.append(

@@ -39,6 +39,7 @@ def make_stage(rng, size, level, zeros=0, frozen=()):
     return report.StageRecord(
         theta=rng.normal(0, 5, (size, 41)),
         cost=mean_cost,
+        judged=mean_cost,
         ep_return=returns.mean(0),
         algorithm_cost=cost,
         algorithm_return=returns,

@@ -282,11 +282,16 @@ def _tracked(metrics: tuple[Metrics, ...]) -> Metrics:
     return {name: jnp.stack([group[name] for group in metrics], 1) for name in TRACKED}
 
 
-def pick_label(config: SearchConfig, is_zero: bool) -> str:
+def pick_label(
+    config: SearchConfig, is_zero: bool, among_finalists: bool = False
+) -> str:
     """In words, by which rule the final pick of a search was made."""
+    against_references = among_finalists and config.references
+    if config.judge_by == "success" or against_references:
+        return "closest to success"
     if is_zero:
         return "zero violation, highest return"
-    return {"cost": "lowest cost", "success": "closest to success"}[config.judge_by]
+    return "fewest violating episodes" if among_finalists else "lowest cost"
 
 
 def require_survivors(config: SearchConfig, state: ESState) -> None:

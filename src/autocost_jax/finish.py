@@ -96,7 +96,7 @@ def _card(
     evaluation = {row["algorithm"]: row for row in rows if row["cost"] == BEST}
     is_zero = all(row["violation_rate"] == 0 for row in evaluation.values())
     return {
-        "label": pick_label(config, is_zero),
+        "label": pick_label(config, is_zero, config.num_finalists > 0),
         "environment": config.train.env.name,
         "stage": stage,
         "index": index,

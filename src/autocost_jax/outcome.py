@@ -16,7 +16,12 @@ from autocost_jax.records import EvalResult, Key
 from autocost_jax.report_assets.data import COST_NAMES, NAMES
 from autocost_jax.scene import Recording, first_recording, watch_first
 from autocost_jax.stages import REFERENCES, deal
-from autocost_jax.success import RETURN_KEPT, VIOLATIONS_LEFT, shortfall
+from autocost_jax.success import (
+    RETURN_KEPT,
+    VIOLATIONS_LEFT,
+    is_success,
+    shortfall,
+)
 from autocost_jax.train import Learner
 
 BEST = "best"
@@ -174,13 +179,15 @@ def succeeded(rows: list[dict[str, Any]]) -> bool:
     """Whether the best cost is safer than the extrinsic one at a bearable price."""
     if not _can_be_judged(rows):
         return False
-    for name in dict.fromkeys(row["algorithm"] for row in rows):
-        best, plain = row_of(rows, name, BEST), row_of(rows, name, "extrinsic")
-        is_safe = best["violation_rate"] <= VIOLATIONS_LEFT * plain["violation_rate"]
-        is_useful = best["return"] >= RETURN_KEPT * plain["return"] > 0
-        if not (is_safe and is_useful):
-            return False
-    return True
+    algorithms = dict.fromkeys(row["algorithm"] for row in rows)
+    return all(reaches_bars(rows, name) for name in algorithms)
+
+
+def reaches_bars(rows: list[dict[str, Any]], algorithm: str) -> bool:
+    """Whether the best cost reaches both bars of success with one algorithm."""
+    best, plain = (row_of(rows, algorithm, cost) for cost in (BEST, "extrinsic"))
+    names = ("violation_rate", "return")
+    return is_success(*(best[name] for name in names), *(plain[name] for name in names))
 
 
 def conclusion(rows: list[dict[str, Any]], num_steps: int) -> str:

@@ -48,7 +48,7 @@ class StageResult(struct.PyTreeNode):
       candidates: [P, D].
       fitness: fields [P].
       scores: `TRACKED` metrics averaged over the fitness epochs, each [A, P].
-      references: the same of the reference costs, each [A, R].
+      references: the same of the reference costs, each [A, R], without frozen agents.
       order: [P] candidate indices, best first, as `rank` has them.
       frozen: [A, P] bool, whether an agent met a non-finite number.
     """
@@ -201,14 +201,23 @@ def stage_result(
     dealt, size = deal(config), config.population_size
     # A state that was not visited in an epoch has no intrinsic cost there: NaN.
     last = {
-        name: (jnp.nanmean if name.startswith("intrinsic") else jnp.mean)(
-            dealt.table(value[-config.fitness_epochs :]), axis=(0, -1)
-        )
+        name: dealt.table(value[-config.fitness_epochs :])
         for name, value in history.items()
     }
-    scores = {name: value[:, :size] for name, value in last.items()}
-    references = {name: value[:, size:] for name, value in last.items()}
-    frozen = jnp.any(dealt.table(frozen)[:, :size], axis=-1)
+    frozen = dealt.table(frozen)  # [A, C, S]
+    scores = {
+        name: (jnp.nanmean if name.startswith("intrinsic") else jnp.mean)(
+            value[:, :, :size], axis=(0, -1)
+        )
+        for name, value in last.items()
+    }
+    references = {  # of the seeds that did not break; NaN if all did
+        name: jnp.nanmean(
+            jnp.where(frozen[:, size:], jnp.nan, value[:, :, size:]), axis=(0, -1)
+        )
+        for name, value in last.items()
+    }
+    frozen = jnp.any(frozen[:, :size], axis=-1)
     broken = jnp.any(frozen, axis=0)
     if config.judge_by == "cost":
         cost = jnp.mean(scores["ep_cost"], axis=0)

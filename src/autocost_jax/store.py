@@ -403,8 +403,9 @@ def open_run(
 def _run_files(path: Path) -> list[Path]:
     """What a run owns in its directory, but for its config and its lock."""
     names = (METRICS, "tensorboard", "checkpoints", "policies", "report")
-    arrays = ("stage_*.npz", "cost.npz", "cost.json", "replay.npz", "evaluation.json")
-    patterns = (*names, *arrays, f"{TEMPORARY}*")
+    arrays = ("stage_*.npz", "cost.npz", "replay*.npz")
+    texts = ("cost.json", "summary.json", "evaluation.json")
+    patterns = (*names, *arrays, *texts, f"{TEMPORARY}*")
     return [file for pattern in patterns for file in path.glob(pattern)]
 
 

@@ -17,14 +17,23 @@ RETURN_KEPT = 0.3
 LEAST = 0.01  # violations and shares of the return are told apart down to here
 
 
+def is_success(
+    violations: float, ep_return: float, plain_violations: float, plain_return: float
+) -> bool:
+    """Whether one algorithm's agents reach both bars; arguments as in `shortfall`."""
+    is_safe = violations <= VIOLATIONS_LEFT * plain_violations
+    return bool(is_safe and ep_return >= RETURN_KEPT * plain_return > 0)
+
+
 def shortfall(
     violations: Any, ep_return: Any, plain_violations: Any, plain_return: Any
 ) -> jax.Array:
     """How far costs are from success, 0 for those that reach it.
 
     It adds up, over the algorithms, log(violations / bar) and log(bar / return) where
-    these are above 0. Unlike a mean over algorithms it lets no algorithm make up for
-    another, and unlike a minimal return it tells a near miss from agents that flee.
+    these are above 0; shares below 1 % count as 1 %. Unlike a mean over algorithms it
+    lets no algorithm make up for another, and unlike a minimal return it tells a near
+    miss from agents that flee. An algorithm whose reference broke (NaN) has no bars.
 
     Args:
       violations: [A, C] share of violating episodes of each algorithm's agents.
@@ -39,4 +48,6 @@ def shortfall(
     least = jnp.maximum(RETURN_KEPT * plain_return, LEAST)[:, None]
     unsafe = jnp.log(jnp.maximum(violations, LEAST) / most)
     useless = jnp.log(least / jnp.maximum(ep_return, LEAST * least))
-    return (jnp.maximum(unsafe, 0.0) + jnp.maximum(useless, 0.0)).sum(0)
+    far = jnp.maximum(unsafe, 0.0) + jnp.maximum(useless, 0.0)
+    has_bars = jnp.isfinite(jnp.asarray(plain_violations) + plain_return)
+    return jnp.where(has_bars[:, None], far, 0.0).sum(0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from autocost_jax.arrays import RunDirError, load_arrays
 from autocost_jax.config import SearchConfig
-from autocost_jax.es import Fitness, rank
+from autocost_jax.es import Fitness, pool, rank
 from autocost_jax.evolution import pick_label
 from autocost_jax.report import (
     BestCandidate,
@@ -127,6 +127,7 @@ def _stage_record(config: SearchConfig, arrays: dict[str, np.ndarray]) -> StageR
     return StageRecord(
         theta=arrays["theta"],
         cost=arrays["cost"],
+        judged=arrays["judged"],
         ep_return=arrays["ep_return"],
         algorithm_cost=arrays["scores/ep_cost"],
         algorithm_return=arrays["scores/ep_return"],
@@ -155,11 +156,13 @@ def _best(
     """
     if not stages or not all(stage.finite.any() for stage in stages):
         return None
-    costs, returns = (
-        np.concatenate([getattr(stage, name) for stage in stages])
-        for name in ("cost", "ep_return")
+    theta, judged, returns = (
+        jnp.concatenate([jnp.asarray(getattr(stage, name)) for stage in stages])
+        for name in ("theta", "judged", "ep_return")
     )
-    fitness = Fitness(jnp.asarray(costs), jnp.asarray(returns))
+    fitness = Fitness(judged, returns)
+    if config.pool_scores:
+        fitness = pool(theta, fitness)
     first = int(rank(fitness, config.zero_tolerance)[0])
     number, index = divmod(first, config.population_size)
     number, index = card.get("stage", number), card.get("index", index)
@@ -171,7 +174,7 @@ def _best(
         stage=number,
         index=index,
         theta=stage.theta[index],
-        label=pick_label(config, is_zero),
+        label=card.get("label", pick_label(config, is_zero)),
         card=tuple(f"{key}: {card[key]}" for key in shown if key in card),
     )
 

@@ -25,6 +25,7 @@ class StageRecord:
     Attributes:
       theta: [P, D] the candidates' networks.
       cost: [P] extrinsic cost of an episode, mean over the agents; +inf: frozen.
+      judged: [P] what the candidates are ranked by, see `SearchConfig.judge_by`.
       ep_return: [P] return of an episode, likewise; -inf: frozen.
       algorithm_cost: [A, P] the same cost of each algorithm's agent.
       algorithm_return: [A, P] the same return of each algorithm's agent.
@@ -40,6 +41,7 @@ class StageRecord:
 
     theta: Array
     cost: Array
+    judged: Array
     ep_return: Array
     algorithm_cost: Array
     algorithm_return: Array
