@@ -87,7 +87,7 @@ def test_a_timed_call_can_be_one_epoch(monkeypatch, tmp_path):
 
 
 def test_update_speed_is_the_difference_of_two_programs(rates):
-    train = preset("laptop").train
+    train = dataclasses.replace(preset("paper").train, num_worlds=4)
     row = update_speed(train, "cpo", 3, jax.devices()[:1])
     assert row.seconds == 6.0  # 12,000 steps at 1000 less at 2000 a second
     flop = 3 * update_flop(train, "cpo", make_env(train.env))
