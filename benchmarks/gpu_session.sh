@@ -30,4 +30,3 @@ part paper 150 python benchmarks/population.py --preset paper --parts closed_for
 part update 100 python benchmarks/population.py --preset paper --parts update --update-slots 50 \
     --precisions float32 tensorfloat32 bfloat16 --out "$out"
 part search 95 python benchmarks/population.py --preset search --parts closed_form slots --out "$out"
-part run 150 python -m autocost_jax.evolve --preset search --physics closed_form --out "$out/run"

@@ -226,7 +226,7 @@ RULES = [
     *(Rule("short", e, s) for e in (16, 32, 48, 64, 96, 128) for s in (1, 2, 3, 5)),
     *(Rule("warm", e, s) for e in (16, 32, 48, 64) for s in (1, 2, 3, 5)),
 ]
-CPU_STEPS_A_MINUTE = 45_000 * 60  # what two cores train, see results/laptop
+CPU_STEPS_A_MINUTE = 45_000 * 60  # of this learner on two cores
 
 
 def judged(arrays: Any, rule: Rule, seeds: tuple[int, ...]) -> dict[str, np.ndarray]:

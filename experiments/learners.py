@@ -1,4 +1,4 @@
-"""What each learner setting of the `laptop` preset is worth at equal env steps.
+"""What learner settings are worth at equal env steps, from REDUCED to the presets'.
 
     python experiments/learners.py run                 # all settings, one process each
     python experiments/learners.py run --only NAME     # one of them

@@ -19,8 +19,8 @@ _LAPTOP_AGENT = AgentConfig(
     cg_iterations=5,
 )
 
-# What `experiments/fitness.py` and `learners.py` support: a start among costs of
-# which some are useful, mild mutations, few and long stages, success as the measure.
+# Long stages rather than many (`experiments/fitness.py`), a start among costs of which
+# some are useful, mild mutations, and what a user asks for as the measure.
 _GUIDED: dict[str, Any] = {
     "start": "graded",
     "init_std": 8.0,
