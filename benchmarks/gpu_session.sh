@@ -1,13 +1,12 @@
 #!/usr/bin/env bash
-# Everything that waits for a GPU, in at most 10 minutes, most important first.
+# Rates of the programs on a GPU, in at most 8 minutes, most important first.
 #
 #     bash benchmarks/gpu_session.sh [OUT]
 #
 # Writes JSON and tables to OUT (default: benchmarks/results/gpu): time of a step against
 # batch in MJX and in closed form, the `paper` program with the projection of the paper's
-# whole evolution (search_hours), its update in three precisions, the `search` program,
-# programs of 1 to 100 slots, and a whole run of the `search` preset. A part that fails
-# does not stop the others.
+# whole evolution (search_hours), its update in three precisions, the `search` program and
+# programs of 1 to 100 slots. A part that fails does not stop the others.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 out="${1:-benchmarks/results/gpu}"
