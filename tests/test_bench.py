@@ -140,6 +140,7 @@ def test_update_flop_is_what_the_compiler_counts(algorithm):
     assert 0.6 * counted < update_flop(train, algorithm, env) < counted
 
 
+@pytest.mark.slow
 def test_a_warm_compile_reads_the_cache():
     before = getattr(jax.config, "jax_compilation_cache_dir", None)
     config = preset("smoke")
@@ -165,6 +166,7 @@ def test_a_peer_that_cannot_be_measured_says_why(monkeypatch, tmp_path):
     assert "1,234" in table
 
 
+@pytest.mark.slow
 def test_programs_of_more_slots_have_more_worlds():
     train = preset("smoke").train
     train = dataclasses.replace(train, env=closed_form(train.env))

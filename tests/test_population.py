@@ -298,6 +298,7 @@ def test_arrays_without_elements_are_made_anew():
 # The face of it -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_cohorts_travel_with_their_learners():
     """In the program as in the plain function; and final episodes are whole ones."""
     env = make_toy_env()

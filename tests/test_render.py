@@ -274,6 +274,7 @@ def short_job(path, **options):
     return Job(config, recording, path, size=(160, 120), **options)
 
 
+@pytest.mark.slow
 def test_films_and_pictures(gl, tmp_path):
     from matplotlib.image import imread
     from PIL import Image, ImageSequence

@@ -555,6 +555,7 @@ def test_wrong_shapes_are_refused():
         dataclasses.replace(make_replay(steep_theta(), 9), reward=np.zeros(3))
 
 
+@pytest.mark.slow
 def test_paper_sized_report_is_small_and_repeatable(tmp_path):
     rng = np.random.default_rng(2)
     data = make_data(
