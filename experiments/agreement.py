@@ -56,10 +56,9 @@ def variant(name: str, smoke: bool) -> TrainConfig:
     """The reduced learner, 8000 steps an epoch, with what the variant changes."""
     env_changes, train_changes, agent_changes = VARIANTS[name]
     train = TrainConfig(agent=REDUCED, num_worlds=8)
-    if smoke:
-        train = preset("smoke").train
     env = dataclasses.replace(env_config("Goal-Hazard-Point"), physics="closed_form")
     if smoke:
+        train = preset("smoke").train
         env = dataclasses.replace(env, num_steps=50)
     return dataclasses.replace(
         train,

@@ -17,6 +17,7 @@ from autocost_jax.evolution import (
     evolve,
     init_search,
     make_searcher,
+    pick_label,
     search,
 )
 from autocost_jax.report import render_report
@@ -501,6 +502,29 @@ def test_success_is_judged_against_the_extrinsic_cost_for_each_algorithm():
     np.testing.assert_allclose(result.fitness.cost, np.add(far, means), rtol=1e-5)
     assert result.order.tolist() == [3, 1, 2, 0]
     assert result.references["ep_return"].tolist() == [[10.0, 1.0]] * 2
+
+
+def test_a_broken_reference_sets_no_bars():
+    """Seeds that froze are left out; an algorithm without any other judges nothing."""
+    config = dataclasses.replace(FINALS, seeds_per_candidate=2, num_finalists=0)
+    ep_return = jnp.broadcast_to(jnp.arange(12.0), (3, 2, 12))
+    history = make_history(jnp.zeros((3, 2, 12)), ep_return)
+    frozen = jnp.zeros((2, 12), bool).at[0, 8].set(True).at[1, 8:10].set(True)
+    result = stage_result(config, jnp.zeros((4, 41)), history, frozen)
+    np.testing.assert_array_equal(result.references["ep_return"][:, 0], [9.0, np.nan])
+    bar = 0.3 * 9.0  # of PPO-Lagrangian alone
+    far = np.log(bar / np.array([0.5, 2.5, bar, bar]))
+    np.testing.assert_allclose(result.fitness.cost, far, rtol=1e-5, atol=1e-6)
+
+
+def test_the_label_names_the_rule_that_picked():
+    judged = dataclasses.replace(CONFIG, references=True, judge_by="success")
+    assert pick_label(judged, is_zero=True) == "closest to success"
+    assert pick_label(CONFIG, is_zero=True) == "zero violation, highest return"
+    assert pick_label(CONFIG, is_zero=False) == "lowest cost"
+    assert pick_label(CONFIG, False, True) == "fewest violating episodes"
+    compared = dataclasses.replace(CONFIG, references=True)
+    assert pick_label(compared, True, True) == "closest to success"
 
 
 def test_a_candidate_is_judged_by_the_mean_over_its_seeds():

@@ -181,6 +181,8 @@ def test_create_refuses_a_run_but_may_overwrite_it(run: RunDir) -> None:
     run.log_metrics({"a": 1}, 0)
     run.write_stage(0, {"theta": np.zeros(3)})
     run.save_checkpoint({"a": jnp.ones(2)}, 1)
+    run.write_json("summary", {"rows": []})
+    run.write_arrays("replay_best_cpo", {"a": np.zeros(1)})
     (run.path / "notes.txt").write_text("mine")
     run.close()
     with pytest.raises(RunDirError, match="already holds a run"):
