@@ -19,7 +19,7 @@ from typing import Any
 from autocost_jax import env_config, list_envs
 from autocost_jax.bench import env_speed
 from autocost_jax.commandline import use_devices
-from autocost_jax.store import run_facts
+from autocost_jax.runs.directory import run_facts
 
 RESULT = Path(__file__).parent / "results" / "env_steps.json"
 CLOSED_FORM = "Goal-Hazard-Point, closed form"

@@ -24,7 +24,7 @@ from autocost_jax import env_config
 from autocost_jax.bench import Speed, env_speed, slot_speeds
 from autocost_jax.commandline import use_devices
 from autocost_jax.config import AgentConfig, Algorithm, TrainConfig
-from autocost_jax.store import run_facts
+from autocost_jax.runs.directory import run_facts
 
 HERE = Path(__file__).parent
 BATCH, SLOTS = 1024, 8

@@ -30,7 +30,7 @@ from autocost_jax.bench import (
 )
 from autocost_jax.commandline import use_devices
 from autocost_jax.config import Precision, SearchConfig, TrainConfig
-from autocost_jax.store import run_facts
+from autocost_jax.runs.directory import run_facts
 
 RESULTS = Path(__file__).parent / "results"
 SIZES, DEALT = (1, 4, 16, 100), 16

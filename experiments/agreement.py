@@ -19,9 +19,9 @@ import numpy as np
 from common import REDUCED, Options, compact, run_if_needed, run_part, t_interval
 
 from autocost_jax import TrainConfig, env_config, preset
-from autocost_jax.methods import Method, TableConfig
-from autocost_jax.rundata import to_json
-from autocost_jax.store import read_config, read_metrics, run_facts
+from autocost_jax.runs.config_files import to_json
+from autocost_jax.runs.directory import read_config, read_metrics, run_facts
+from autocost_jax.runs.sweep import Method, TableConfig
 
 PLAIN = "plain"
 # What differs from the plain variant: of the world, of the training, of the agent.

@@ -12,9 +12,9 @@ import numpy as np
 
 from autocost_jax.commandline import use_devices
 from autocost_jax.config import AgentConfig
-from autocost_jax.methods import TableConfig, run_table
-from autocost_jax.rundata import first_difference
-from autocost_jax.store import read_config
+from autocost_jax.runs.config_files import first_difference
+from autocost_jax.runs.directory import read_config
+from autocost_jax.runs.sweep import TableConfig, run_table
 
 # The learner of what is trained at reduced scale: smaller networks than the paper's,
 # minibatches in place of 80 full-batch steps, everything else as in the paper.

@@ -30,15 +30,15 @@ import numpy as np
 from common import REDUCED, compact
 
 from autocost_jax.agents.base import actor
-from autocost_jax.arrays import flatten
 from autocost_jax.commandline import use_devices
 from autocost_jax.config import EnvConfig, TrainConfig
 from autocost_jax.costs import training_cost
 from autocost_jax.envs.env import make_env
 from autocost_jax.evaluate import evaluate
+from autocost_jax.files import flatten
 from autocost_jax.population import Population, make_agents, make_population
 from autocost_jax.records import Slot
-from autocost_jax.store import run_facts
+from autocost_jax.runs.directory import run_facts
 
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 REFERENCES = ("extrinsic", "extrinsic+safety_margin_3x")

@@ -29,9 +29,9 @@ from autocost_jax.commandline import use_devices
 from autocost_jax.config import EnvConfig, TrainConfig
 from autocost_jax.envs.env import make_env
 from autocost_jax.evaluate import evaluate
-from autocost_jax.methods import Method, TableConfig, table_slots
 from autocost_jax.population import make_agents, make_population
-from autocost_jax.store import run_facts
+from autocost_jax.runs.directory import run_facts
+from autocost_jax.runs.sweep import Method, TableConfig, table_slots
 
 STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
 COSTS = ("extrinsic", "extrinsic+safety_margin_2x", "extrinsic+safety_margin_3x")

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from autocost_jax.arrays import load_arrays
-from autocost_jax.outcome import reaches_bars, row_of
-from autocost_jax.rundata import read_document, to_json
-from autocost_jax.store import list_stages, read_config
+from autocost_jax.files import load_arrays
+from autocost_jax.runs.config_files import read_document, to_json
+from autocost_jax.runs.directory import list_stages, read_config
+from autocost_jax.runs.outcome import reaches_bars, row_of
 
 SEEDS = (0, 1, 2)
 WORDS = {True: "yes", False: "no", None: "not measured"}

@@ -30,9 +30,9 @@ from common import REDUCED, compact, run_if_needed
 from autocost_jax import TrainConfig, env_config, load_cost, preset
 from autocost_jax.commandline import use_compile_cache, use_devices
 from autocost_jax.config import Algorithm
-from autocost_jax.methods import Learners, Method, TableConfig
-from autocost_jax.rundata import to_json
-from autocost_jax.store import read_config, read_metrics, run_facts
+from autocost_jax.runs.config_files import to_json
+from autocost_jax.runs.directory import read_config, read_metrics, run_facts
+from autocost_jax.runs.sweep import Learners, Method, TableConfig
 
 RESULTS = Path("experiments/results")
 WORLD, CROWDED = "Goal-Hazard-Point", "Goal-Hazard8-Point"

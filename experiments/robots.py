@@ -23,12 +23,12 @@ from common import REDUCED, Options, compact, run_if_needed, run_part, t_interva
 from robots_tables import ALGORITHMS, draw, render
 
 from autocost_jax import Agent, EnvConfig, TrainConfig, env_config, make_env, preset
-from autocost_jax.arrays import write_atomic
-from autocost_jax.methods import Learners, Method, TableConfig, table_slots
-from autocost_jax.policies import EVALUATION, eval_summary
+from autocost_jax.files import write_atomic
 from autocost_jax.population import make_agents, make_evaluator
-from autocost_jax.rundata import to_json
-from autocost_jax.store import read_config, read_metrics, run_facts
+from autocost_jax.runs.config_files import to_json
+from autocost_jax.runs.directory import read_config, read_metrics, run_facts
+from autocost_jax.runs.policies import EVALUATION, eval_summary
+from autocost_jax.runs.sweep import Learners, Method, TableConfig, table_slots
 from autocost_jax.train import init_learner
 
 

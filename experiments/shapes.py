@@ -31,8 +31,8 @@ from autocost_jax.config import THETA_SIZES
 from autocost_jax.costs import BANK, training_cost
 from autocost_jax.population import make_agents, stack_slots
 from autocost_jax.records import CostInputs
-from autocost_jax.rundata import to_json
-from autocost_jax.store import run_facts
+from autocost_jax.runs.config_files import to_json
+from autocost_jax.runs.directory import run_facts
 
 SEEDS = (0, 1)
 LAST = 20  # epochs whose training episodes are scored

@@ -17,9 +17,9 @@ import numpy as np
 import paper
 from common import t_interval
 
-from autocost_jax.arrays import write_atomic
-from autocost_jax.env_config import env_config
-from autocost_jax.store import run_facts
+from autocost_jax.config import env_config
+from autocost_jax.files import write_atomic
+from autocost_jax.runs.directory import run_facts
 
 SCRIPT = Path(__file__).parent / "transfer_safety_gymnasium.py"
 PYTHON = Path("benchmarks/.venv/safety_gymnasium/bin/python")

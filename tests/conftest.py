@@ -20,7 +20,7 @@ def pytest_terminal_summary(
     file = config.getoption("--results")
     if file is None:
         return
-    from autocost_jax.store import run_facts
+    from autocost_jax.runs.directory import run_facts
 
     reports = [
         report

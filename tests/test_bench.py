@@ -18,11 +18,10 @@ from autocost_jax.bench import (
     update_speed,
 )
 from autocost_jax.cli import main
+from autocost_jax.config import EnvConfig, preset
 from autocost_jax.costs import training_cost
-from autocost_jax.env_config import EnvConfig
 from autocost_jax.envs.env import make_env
 from autocost_jax.population import make_agents
-from autocost_jax.presets import preset
 from autocost_jax.records import CostInputs, Slot, Trajectory
 from scripts import load_script
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from autocost_jax.cli import main
-from autocost_jax.methods import Method, TableConfig, table_slots
-from autocost_jax.presets import preset
-from autocost_jax.store import open_run, read_metrics
+from autocost_jax.config import preset
+from autocost_jax.runs.directory import RunDir, read_metrics
+from autocost_jax.runs.sweep import Method, TableConfig, table_slots
 
 TRAIN = ["train", "--preset", "smoke", "--episodes", "3"]
 
@@ -51,7 +51,8 @@ def asked(monkeypatch):
     """The tables that the command line would train."""
     tables = []
     monkeypatch.setattr(
-        "autocost_jax.methods.run_table", lambda config, *_, **__: tables.append(config)
+        "autocost_jax.runs.sweep.run_table",
+        lambda config, *_, **__: tables.append(config),
     )
     return tables
 
@@ -61,7 +62,7 @@ def test_train_resumes_with_another_population_chunk(trained, asked):
     main(["train", "--out", str(trained), "--resume", "--population-chunk", "2"])
     (table,) = asked
     assert table.train.population_chunk == 2
-    with open_run(trained, table, resume=True, overwrite=False) as run:
+    with RunDir.open(trained, table) as run:
         assert run.config == table
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from autocost_jax import cluster
 from autocost_jax.commandline import guarded
-from autocost_jax.store import read_metrics
+from autocost_jax.runs import cluster
+from autocost_jax.runs.directory import read_metrics
 
 FLAGS = ["--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "4"]
 WAIT = 400  # seconds until a process counts as hung

@@ -7,9 +7,14 @@ import sys
 import numpy as np
 import pytest
 
-from autocost_jax.config import AgentConfig, SearchConfig, TrainConfig
-from autocost_jax.env_config import EnvConfig
-from autocost_jax.presets import PRESETS, preset
+from autocost_jax.config import (
+    PRESETS,
+    AgentConfig,
+    EnvConfig,
+    SearchConfig,
+    TrainConfig,
+    preset,
+)
 
 NAN, INF = float("nan"), float("inf")
 COUNT = (0, -1, 1.5, NAN, "3", True)
@@ -210,7 +215,7 @@ def sizes(config: SearchConfig) -> dict[str, object]:
 # The table of sizes: what each preset promises.
 PROMISED = {
     "laptop": {
-        "candidates": 16,
+        "candidates": 19,
         "elites": 3,
         "stages": 2,
         "init_std": 8.0,
@@ -248,7 +253,7 @@ PROMISED = {
         "nets": (16, 16),
     },
 }
-EPOCHS = {"laptop": 48, "search": 64, "paper": 333, "smoke": 2}
+EPOCHS = {"laptop": 40, "search": 64, "paper": 333, "smoke": 2}
 FITNESS_EPOCHS = {"laptop": 12, "search": 16, "paper": 10, "smoke": 1}
 
 
@@ -307,9 +312,9 @@ def test_an_unknown_preset_is_answered_with_the_known_ones():
 
 NO_BACKEND = """
 from jax._src import xla_bridge
-from autocost_jax.methods import Method, TableConfig
-from autocost_jax.presets import PRESETS
-from autocost_jax.rundata import from_dict, to_dict
+from autocost_jax.runs.sweep import Method, TableConfig
+from autocost_jax.config import PRESETS
+from autocost_jax.runs.config_files import from_dict, to_dict
 theta = tuple([0.0] * 41)
 methods = (Method("a", "cpo", "extrinsic+intrinsic", 0.0, theta),)
 table = TableConfig(train=PRESETS["smoke"].train, methods=methods)

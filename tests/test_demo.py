@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from autocost_jax import cost_card
-from autocost_jax.demo import FOUND, write_demo
+from autocost_jax.viz.demo import FOUND, write_demo
 
 
 @pytest.fixture(scope="module")

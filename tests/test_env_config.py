@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from autocost_jax.env_config import ENVS, SUITE, EnvConfig, env_config
+from autocost_jax.config import ENVS, SUITE, EnvConfig, env_config
 
 # kind -> number, radius, keepout
 EIGHT_HAZARDS, FOUR_HAZARDS = (8, 0.3, 0.4), (4, 0.3, 0.4)

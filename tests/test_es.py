@@ -23,8 +23,8 @@ from autocost_jax.es import (
 )
 from autocost_jax.population import jit_bundle
 from autocost_jax.rollout import typical_lidars
-from autocost_jax.stages import make_strategy
-from autocost_jax.starts import (
+from autocost_jax.search.stages import make_strategy
+from autocost_jax.search.starts import (
     LOUD_COSTS,
     LOUD_PLACE,
     QUIET_COST,

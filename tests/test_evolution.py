@@ -8,11 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax import evolution, population
+from autocost_jax import population
 from autocost_jax.commandline import guarded
 from autocost_jax.costs import BANK, CostTerm
 from autocost_jax.es import top, truncation_es
-from autocost_jax.evolution import (
+from autocost_jax.runs.directory import list_stages
+from autocost_jax.runs.search_run import run_search
+from autocost_jax.search import evolution
+from autocost_jax.search.evolution import (
     best_of,
     evolve,
     init_search,
@@ -20,9 +23,7 @@ from autocost_jax.evolution import (
     pick_label,
     search,
 )
-from autocost_jax.report import render_report
-from autocost_jax.run import run_search
-from autocost_jax.stages import (
+from autocost_jax.search.stages import (
     ASK,
     TRACKED,
     deal,
@@ -30,8 +31,8 @@ from autocost_jax.stages import (
     stage_result,
     stage_slots,
 )
-from autocost_jax.store import list_stages
-from autocost_jax.summary import load_report
+from autocost_jax.viz.report import render_report
+from autocost_jax.viz.run_data import load_report
 from toys import (
     Counter,
     linear_agent,

@@ -1,6 +1,7 @@
 """The main job from its command line: whole, killed, resumed, and misused."""
 
 import dataclasses
+import importlib
 import json
 import os
 import signal
@@ -15,20 +16,19 @@ import pytest
 import yaml
 
 import autocost_jax
-from autocost_jax import evolve as evolve_module
 from autocost_jax.commandline import use_compile_cache
-from autocost_jax.evolve import main
-from autocost_jax.presets import preset
-from autocost_jax.rundata import first_difference
-from autocost_jax.store import (
+from autocost_jax.config import preset
+from autocost_jax.evolve import evolve
+from autocost_jax.evolve.__main__ import main
+from autocost_jax.runs.config_files import first_difference
+from autocost_jax.runs.directory import (
     RunDir,
     RunDirError,
     list_stages,
-    open_run,
     read_config,
     read_metrics,
 )
-from autocost_jax.summary import load_report
+from autocost_jax.viz.run_data import load_report
 
 SMOKE = ["--preset", "smoke", "--physics", "closed_form", "--eval-episodes", "4"]
 SMOKE += ["--seed", "3"]
@@ -259,7 +259,7 @@ def asked(monkeypatch):
     def run_search(config, path, *, resume, **_):
         calls.append((config, path, resume))
 
-    monkeypatch.setattr("autocost_jax.run.run_search", run_search)
+    monkeypatch.setattr("autocost_jax.runs.search_run.run_search", run_search)
     return calls
 
 
@@ -271,7 +271,7 @@ def test_resume_uses_another_population_chunk(asked, tmp_path):
     assert resume
     assert config.train.population_chunk == 3
     assert first_difference(recorded, config) is None
-    with open_run(tmp_path, config, resume=True, overwrite=False) as run:
+    with RunDir.open(tmp_path, config) as run:
         assert run.config == config
 
 
@@ -369,10 +369,10 @@ def test_config_of_a_run_can_be_used_for_another(whole, tmp_path, capsys):
     assert "1 stages of 4 candidates" in capsys.readouterr().out
 
 
-def test_the_module_is_the_function_too():
-    # `import autocost_jax.evolve` binds the module to the name of the function.
-    assert callable(evolve_module)
-    assert callable(autocost_jax.evolve)
+def test_the_function_keeps_its_name():
+    """Importing the package of the command line must not take it away."""
+    importlib.import_module("autocost_jax.evolve.__main__")
+    assert autocost_jax.evolve is evolve
 
 
 def test_config_yaml_is_plain_yaml(whole):

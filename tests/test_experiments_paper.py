@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from autocost_jax.config import ENVS
 from autocost_jax.costs import total_cost
-from autocost_jax.env_config import ENVS
 from autocost_jax.records import CostInputs
-from autocost_jax.store import RunDir
+from autocost_jax.runs.directory import RunDir
 from scripts import ROOT, load_script
 
 FIGURES = (

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from autocost_jax import TrainConfig
-from autocost_jax.methods import Method, TableConfig
-from autocost_jax.store import RunDir
+from autocost_jax.runs.directory import RunDir
+from autocost_jax.runs.sweep import Method, TableConfig
 from scripts import load_script
 
 ROOT = Path(__file__).parents[1]

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from autocost_jax.config import preset
 from autocost_jax.costs import load_cost
-from autocost_jax.presets import preset
 from scripts import load_script
 
 RESULTS = Path(__file__).parents[1] / "experiments" / "results"

@@ -202,7 +202,7 @@ import jax
 import numpy as np
 from test_population import ALGORITHMS, groups, run
 from toys import TRAIN, linear_agent, make_toy_env, train_config
-from autocost_jax.arrays import flatten
+from autocost_jax.files import flatten
 from autocost_jax.population import make_agents, make_population
 
 jax.config.update("jax_platforms", "cpu")

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax import progress
 from autocost_jax.config import SearchConfig, TrainConfig
-from autocost_jax.progress import (
+from autocost_jax.runs import progress
+from autocost_jax.runs.progress import (
     COLUMNS,
     Display,
     format_seconds,
     stage_lines,
     summarise,
 )
-from autocost_jax.stages import TRACKED, stage_result
+from autocost_jax.search.stages import TRACKED, stage_result
 
 CONFIG = SearchConfig(
     train=TrainConfig(num_epochs=27),
@@ -121,7 +121,7 @@ def test_a_slow_machine_is_told_from_the_first_epochs(
     summary, monkeypatch, seconds, warns
 ):
     now = [0.0]
-    monkeypatch.setattr("autocost_jax.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("autocost_jax.runs.progress.time.monotonic", lambda: now[0])
     stream = io.StringIO()
     with Display(1000, 0, stream, planned=150.0) as display:
         display.start_clock()
@@ -159,7 +159,7 @@ def test_a_terminal_gets_a_table_with_one_row_a_stage(summary, monkeypatch):
 
 def test_rate_and_time_left_count_only_this_process(summary, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("autocost_jax.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("autocost_jax.runs.progress.time.monotonic", lambda: now[0])
     stream = io.StringIO()
     with Display(1000, 0, stream) as display:
         display.skip(400)  # done before a resume

@@ -9,10 +9,10 @@ import pytest
 
 from autocost_jax import env_config, preset
 from autocost_jax.cli import HELP
-from autocost_jax.env_config import ENVS
-from autocost_jax.envs.models import scene_model
-from autocost_jax.evolve import main as evolve_main
-from autocost_jax.starts import LOUD_COSTS, QUIET_PLACES
+from autocost_jax.config import ENVS
+from autocost_jax.envs.physics.models import scene_model
+from autocost_jax.evolve.__main__ import main as evolve_main
+from autocost_jax.search.starts import LOUD_COSTS, QUIET_PLACES
 from scripts import load_script
 
 ROOT = Path(__file__).parents[1]
@@ -137,8 +137,8 @@ def test_the_wheel_would_hold_everything_that_is_read_at_run_time():
         "src/autocost_jax"
     ]
     package = ROOT / "src" / "autocost_jax"
-    xmls = [f"envs/xmls/{robot}.xml" for robot in ("point", "car", "doggo")]
-    for name in ("py.typed", "report_assets/page.html", *xmls):
+    xmls = [f"envs/physics/xmls/{robot}.xml" for robot in ("point", "car", "doggo")]
+    for name in ("py.typed", "viz/page.html", *xmls):
         assert (package / name).exists()
 
 

@@ -12,19 +12,18 @@ import jax
 import numpy as np
 import pytest
 
-from autocost_jax import gallery, picture, scene
 from autocost_jax.agents.base import actor
-from autocost_jax.arrays import flatten
 from autocost_jax.cli import main
-from autocost_jax.env_config import ENVS, SUITE, EnvConfig, env_config
+from autocost_jax.config import ENVS, SUITE, EnvConfig, env_config, preset
 from autocost_jax.envs.env import make_env
-from autocost_jax.methods import Method, TableConfig
-from autocost_jax.picture import FILMS, FPS, MOST_FRAMES, Job, film_frames
-from autocost_jax.policies import SCRIPTS, scripted_agent
+from autocost_jax.files import flatten
 from autocost_jax.population import make_agents
-from autocost_jax.presets import preset
-from autocost_jax.report_assets.player import replay_page
-from autocost_jax.store import RunDir
+from autocost_jax.runs.directory import RunDir
+from autocost_jax.runs.policies import SCRIPTS, scripted_agent
+from autocost_jax.runs.sweep import Method, TableConfig
+from autocost_jax.viz import gallery, picture, scene
+from autocost_jax.viz.picture import FILMS, FPS, MOST_FRAMES, Job, film_frames
+from autocost_jax.viz.player import replay_page
 from pages import browse, check_page
 from test_scene import still_recording
 

@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax import scene
-from autocost_jax.env_config import ENVS, EnvConfig, env_config
+from autocost_jax.config import ENVS, EnvConfig, env_config
 from autocost_jax.envs.env import make_env
-from autocost_jax.envs.world import make_world
-from autocost_jax.policies import scripted_agent
+from autocost_jax.envs.physics.world import make_world
+from autocost_jax.evaluate import first_recording, watch_first
 from autocost_jax.population import make_evaluator
-from autocost_jax.report_assets.player import replay_page
-from autocost_jax.report_assets.replay import UNKNOWN, replay_json
+from autocost_jax.runs.policies import scripted_agent
+from autocost_jax.viz import scene
+from autocost_jax.viz.player import replay_page
+from autocost_jax.viz.replay import UNKNOWN, replay_json
 
 ROUNDING = 1e-5  # float32 kinematics and lidars in another order
 NUM_STEPS = 40
@@ -87,7 +88,7 @@ def episode():
 
     def watch(worlds):
         seen = {"obs": worlds.obs[0], "xy": worlds.layout.robot_xy[0]}
-        return scene.watch_first(worlds) | seen
+        return watch_first(worlds) | seen
 
     run = make_evaluator(env, agent, 2, watch=watch)
     _, episodes = run(jnp.zeros(1), jax.random.key(0))
@@ -97,7 +98,7 @@ def episode():
 
 def test_poses_and_lidars_are_those_of_the_episode(episode):
     config, env, episodes = episode
-    recording = scene.first_recording(episodes)
+    recording = first_recording(episodes)
     replay = scene.make_replay(config, recording)
     assert replay.poses.shape[0] == NUM_STEPS + 1
     robot = replay.poses[:, replay.robot]
@@ -132,7 +133,7 @@ def test_long_episodes_are_thinned_without_losing_a_sum(monkeypatch):
 
 def test_packed_poses_keep_a_tenth_of_a_millimetre(episode):
     config, _, episodes = episode
-    replay = scene.make_replay(config, scene.first_recording(episodes))
+    replay = scene.make_replay(config, first_recording(episodes))
     data = replay_json(replay)
     json.dumps(data, allow_nan=False)
     assert replay.robot in data["moving"]

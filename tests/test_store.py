@@ -21,10 +21,11 @@ import orbax.checkpoint as ocp
 import pytest
 import yaml
 
-from autocost_jax import arrays, checkpoints, store
-from autocost_jax.config import SearchConfig
-from autocost_jax.presets import PRESETS, preset
-from autocost_jax.store import ArraySpec, DiskFullError, RunDir, RunDirError
+from autocost_jax import files as arrays
+from autocost_jax.config import PRESETS, SearchConfig, preset
+from autocost_jax.runs import checkpoints
+from autocost_jax.runs import directory as store
+from autocost_jax.runs.directory import ArraySpec, DiskFullError, RunDir, RunDirError
 
 FACTS = store.run_facts(0)
 SMOKE = preset("smoke")
@@ -269,7 +270,7 @@ def test_open_warns_of_other_versions(tmp_path: Path) -> None:
 
 HOLDER = """
 import sys
-from autocost_jax.store import RunDir
+from autocost_jax.runs.directory import RunDir
 run = RunDir.open(sys.argv[1])
 print("held", flush=True)
 sys.stdin.read()
@@ -452,7 +453,7 @@ def test_what_a_kill_left_is_ignored_and_cleaned(
 WRITER = """
 import sys
 import numpy as np
-from autocost_jax.store import RunDir
+from autocost_jax.runs.directory import RunDir
 with RunDir.open(sys.argv[1]) as run:
     for step in range(1, 10**6):
         run.log_metrics({"a": step}, step)
@@ -539,8 +540,8 @@ QUIET = """
 import sys, warnings
 warnings.simplefilter("error")
 import numpy as np
-from autocost_jax.presets import preset
-from autocost_jax.store import RunDir
+from autocost_jax.config import preset
+from autocost_jax.runs.directory import RunDir
 with RunDir.create(sys.argv[1], preset("smoke")) as run:
     run.save_checkpoint({"a": np.ones(3, np.float32)}, 1)
     run.resume({"a": np.ones(3, np.float32)})

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax.success import is_success, shortfall
+from autocost_jax.search.success import is_success, shortfall
 
 PLAIN = (jnp.array([0.8, 0.4]), jnp.array([10.0, 20.0]))  # bars 0.2, 0.1 and 3, 6
 
@@ -19,7 +19,8 @@ def test_at_both_bars_nothing_is_missing():
 
 def test_what_is_missing_adds_up_over_algorithms_and_bars():
     got = far([[0.4], [0.1]], [[1.5], [3.0]])
-    assert got == pytest.approx([3 * np.log(2)], rel=1e-5)
+    # a third of the way from 25 % to all violations, and twice half the return
+    assert got == pytest.approx([1 / 3 + 1 / 2 + 1 / 2], rel=1e-5)
 
 
 def test_no_algorithm_makes_up_for_another():
@@ -31,7 +32,7 @@ def test_no_algorithm_makes_up_for_another():
 
 def test_agents_that_flee_are_farther_off_than_a_near_miss():
     fleeing, near = far([[0.0, 0.22], [0.0, 0.1]], [[-9.0, 2.9], [-9.0, 6.0]])
-    assert fleeing == pytest.approx(2 * np.log(100), rel=1e-5)
+    assert fleeing == pytest.approx(4.0 + 2.5, rel=1e-5)
     assert near < 0.2
 
 

@@ -11,11 +11,10 @@ import pytest
 
 from autocost_jax.agents import cpo, ppo_lagrangian
 from autocost_jax.costs import BANK, CostTerm, intrinsic_cost, training_cost
+from autocost_jax.metrics import cost_by_distance, episode_metrics
 from autocost_jax.population import stack_slots
 from autocost_jax.records import CostInputs, Slot, Trajectory
 from autocost_jax.train import (
-    awareness,
-    episode_metrics,
     final_episodes,
     init_learner,
     run_epoch,
@@ -139,7 +138,7 @@ def test_metrics_of_whole_episodes(key):
     trajectory = make_trajectory(key, jnp.ones((10, 6)))
     theta = jax.random.normal(key, (41,))
     total = jax.random.uniform(key, (10, 6))
-    got = episode_metrics(trajectory, total, 10) | awareness(trajectory, theta)
+    got = episode_metrics(trajectory, total, 10) | cost_by_distance(trajectory, theta)
     inputs = jax.tree.map(lambda x: np.asarray(x, np.float64), trajectory.cost_inputs)
     sums = {
         "ep_return": np.asarray(trajectory.reward, np.float64).sum(axis=0),
@@ -176,7 +175,7 @@ def test_nowhere_far_or_near_is_nan(key):
     trajectory = make_trajectory(key, jnp.ones((4, 2)))
     inputs = trajectory.cost_inputs.replace(distance=jnp.full((4, 2), 2.0))
     trajectory = trajectory.replace(cost_inputs=inputs)
-    got = awareness(trajectory, jnp.zeros(41))
+    got = cost_by_distance(trajectory, jnp.zeros(41))
     assert np.isnan(got["intrinsic_far"])
     assert np.isnan(got["intrinsic_near"])
 

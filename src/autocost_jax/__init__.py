@@ -7,7 +7,15 @@ autocost_jax.evolve` is the main job, `autocost --help` lists the other commands
 from autocost_jax.agents.base import Agent, AgentState
 from autocost_jax.agents.cpo import cpo
 from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
-from autocost_jax.config import AgentConfig, SearchConfig, TrainConfig
+from autocost_jax.config import (
+    PRESETS,
+    AgentConfig,
+    EnvConfig,
+    SearchConfig,
+    TrainConfig,
+    env_config,
+    preset,
+)
 from autocost_jax.costs import (
     BANK,
     CostTerm,
@@ -19,7 +27,6 @@ from autocost_jax.costs import (
     total_cost,
     training_cost,
 )
-from autocost_jax.env_config import EnvConfig, env_config
 from autocost_jax.envs.env import Env, list_envs, make_env
 from autocost_jax.es import (
     ES,
@@ -32,9 +39,8 @@ from autocost_jax.es import (
     truncation_es,
 )
 from autocost_jax.evaluate import evaluate
-from autocost_jax.evolution import evolve, search
+from autocost_jax.evolve import evolve, search
 from autocost_jax.population import make_population, stack_slots
-from autocost_jax.presets import PRESETS, preset
 from autocost_jax.records import (
     CostInputs,
     EnvState,
@@ -46,7 +52,7 @@ from autocost_jax.records import (
     Trajectory,
 )
 from autocost_jax.rollout import reset_worlds, unroll
-from autocost_jax.starts import graded_start
+from autocost_jax.search.starts import graded_start
 from autocost_jax.train import run_stage, train
 
 __all__ = [

@@ -18,9 +18,8 @@ from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import Mesh, PartitionSpec
 
 from autocost_jax.agents.base import Agent
-from autocost_jax.config import Algorithm, SearchConfig, TrainConfig
+from autocost_jax.config import Algorithm, EnvConfig, SearchConfig, TrainConfig
 from autocost_jax.costs import training_cost
-from autocost_jax.env_config import EnvConfig
 from autocost_jax.envs.env import Env, make_env, make_physics
 from autocost_jax.population import (
     Population,

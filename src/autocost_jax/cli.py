@@ -118,7 +118,7 @@ def _train(argv: list[str]) -> None:
     # Before anything of JAX runs:
     group = (options.coordinator, options.num_processes, options.process_id)
     devices = use_devices(options.devices, *group)
-    from autocost_jax.methods import Method, TableConfig, run_table
+    from autocost_jax.runs.sweep import Method, TableConfig, run_table
 
     if recorded is not None:
         config = replace(recorded, train=options.train)
@@ -147,12 +147,12 @@ def _train_defaults(argv: list[str], out: Path) -> tuple[Any, Any]:
 
     The latter is the `TrainConfig` of a preset, or on --resume without one the run's.
     """
-    from autocost_jax.presets import preset
+    from autocost_jax.config import preset
 
     name, recorded = flag(argv, "--preset"), None
     if switch(argv, "--resume"):
-        from autocost_jax.methods import TableConfig
-        from autocost_jax.rundata import read_config
+        from autocost_jax.runs.config_files import read_config
+        from autocost_jax.runs.sweep import TableConfig
 
         named = flag(argv, "--out")
         recorded, _ = read_config(out if named is None else named, TableConfig)
@@ -195,17 +195,17 @@ def _evaluate(argv: list[str]) -> None:
     use_compile_cache(options.compile_cache)
     import jax
 
-    from autocost_jax.arrays import write_atomic
     from autocost_jax.envs.env import make_env
-    from autocost_jax.policies import (
+    from autocost_jax.files import write_atomic
+    from autocost_jax.population import make_evaluator
+    from autocost_jax.runs.config_files import to_json
+    from autocost_jax.runs.policies import (
         EVALUATION,
         eval_summary,
         load_policies,
         policy_files,
         score_line,
     )
-    from autocost_jax.population import make_evaluator
-    from autocost_jax.rundata import to_json
 
     config = run_config(options.run)
     files = policy_files(options.run, options.policies)
@@ -246,11 +246,10 @@ def _bench(argv: list[str]) -> None:
 
     options = parse(Options, argv, "autocost bench")
     devices = use_devices(options.devices)  # before anything of JAX runs
-    from autocost_jax.arrays import write_atomic
     from autocost_jax.bench import bench
-    from autocost_jax.env_config import EnvConfig, env_config
-    from autocost_jax.presets import preset
-    from autocost_jax.store import run_facts
+    from autocost_jax.config import EnvConfig, env_config, preset
+    from autocost_jax.files import write_atomic
+    from autocost_jax.runs.directory import run_facts
 
     if options.batch < 1 or options.batch % len(devices):
         count = len(devices)
@@ -290,14 +289,13 @@ def _info(argv: list[str]) -> None:
     import yaml
 
     if options.run is not None:
-        from autocost_jax.rundata import read_document
+        from autocost_jax.runs.config_files import read_document
 
         print(yaml.safe_dump(read_document(options.run), sort_keys=False), end="")
         return
+    from autocost_jax.config import ENVS, PRESETS, SUITE
     from autocost_jax.costs import BANK, list_costs
-    from autocost_jax.env_config import ENVS, SUITE
-    from autocost_jax.presets import PRESETS
-    from autocost_jax.store import run_facts
+    from autocost_jax.runs.directory import run_facts
 
     facts = run_facts()
     facts.pop("seed")

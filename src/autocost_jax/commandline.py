@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from autocost_jax.config import TrainConfig
-from autocost_jax.env_config import env_config
+from autocost_jax.config import TrainConfig, env_config
 
 T = TypeVar("T")
 BAD_INPUT = 2
@@ -85,7 +84,7 @@ def with_env(train: TrainConfig, argv: Sequence[str]) -> TrainConfig:
 
 def fail(message: str, status: int = BAD_INPUT) -> None:
     """End the program with one line on stderr."""
-    from autocost_jax.cluster import leave
+    from autocost_jax.runs.cluster import leave
 
     sys.stderr.write(" ".join(message.split()) + "\n")
     leave(status)
@@ -97,8 +96,8 @@ def guarded(main: Callable[[], None], prog: str) -> None:
 
     Bad input is status 2, a run that could not go on is 1, Ctrl-C is 130.
     """
-    from autocost_jax.arrays import DiskFullError
-    from autocost_jax.cluster import is_lost_peer
+    from autocost_jax.files import DiskFullError
+    from autocost_jax.runs.cluster import is_lost_peer
 
     try:
         main()
@@ -169,7 +168,7 @@ def use_devices(
     """
     import jax
 
-    from autocost_jax import cluster
+    from autocost_jax.runs import cluster
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     with contextlib.suppress(RuntimeError):  # too late to split: take what is there

@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.arrays import load_arrays
 from autocost_jax.config import THETA_SIZES
+from autocost_jax.files import load_arrays
 from autocost_jax.records import CostInputs, TrainingCost
 
 HIDDEN = 4  # the paper's hidden layer: 8 * 4 + 4 + 4 + 1 = 41 parameters
@@ -237,7 +237,7 @@ def save_cost(
 
 def list_costs() -> list[str]:
     """Names of the costs that the package brings along."""
-    folder = resources.files("autocost_jax") / "found"
+    folder = resources.files("autocost_jax") / "pretrained"
     files = folder.iterdir() if folder.is_dir() else ()
     return sorted(file.name[:-4] for file in files if file.name.endswith(".npz"))
 
@@ -289,7 +289,9 @@ def _check_theta(file: Path, theta: np.ndarray) -> None:
 def _cost_file(path: str | Path) -> Path:
     """The file of a cost that the package brings along, or of a path."""
     if str(path) in list_costs():
-        return _npz(Path(str(resources.files("autocost_jax") / "found" / str(path))))
+        return _npz(
+            Path(str(resources.files("autocost_jax") / "pretrained" / str(path)))
+        )
     return _npz(Path(path))
 
 

@@ -1,10 +1,11 @@
 """Whole episodes of a fixed policy on fresh layouts."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from autocost_jax.agents.base import Agent
@@ -33,6 +34,28 @@ class Episodes(struct.PyTreeNode):
     watched: Any
     distance_travelled: jax.Array
     steps_outside: jax.Array
+
+
+class Recording(NamedTuple):
+    """One episode as arrays; row 0 is the start, row t the state after step t.
+
+    Attributes:
+      qpos: [T + 1, nq] positions as in `scene_model`.
+      goal_xy: [T + 1, 2] goal centre, metres.
+      hazards: [H, 2] hazard centres.
+      pillars: [Q, 2] pillar centres.
+      reward: [T] rewards.
+      cost: [T] extrinsic costs.
+      constraint_lidar: [T, 8] what the intrinsic cost sees.
+    """
+
+    qpos: np.ndarray
+    goal_xy: np.ndarray
+    hazards: np.ndarray
+    pillars: np.ndarray
+    reward: np.ndarray
+    cost: np.ndarray
+    constraint_lidar: np.ndarray
 
 
 def _nothing(worlds: EnvState) -> tuple[()]:
@@ -86,6 +109,25 @@ def run_episodes(
         ),
         distance_travelled=worlds.metrics["distance_travelled"].astype(jnp.float32),
         steps_outside=worlds.metrics["steps_outside"].astype(jnp.float32),
+    )
+
+
+def watch_first(worlds: EnvState) -> dict[str, jax.Array]:
+    """What a `Recording` needs of the first of many worlds; see `run_episodes`."""
+    return {"qpos": worlds.data.qpos[0], "goal_xy": worlds.layout.goal_xy[0]}
+
+
+def first_recording(episodes: Episodes) -> Recording:
+    """The first of the episodes that `watch_first` has watched."""
+    episodes = jax.tree.map(np.asarray, episodes)
+    return Recording(
+        qpos=episodes.watched["qpos"],
+        goal_xy=episodes.watched["goal_xy"],
+        hazards=np.asarray(episodes.start.hazards[0]),
+        pillars=np.asarray(episodes.start.pillars[0]),
+        reward=np.asarray(episodes.reward[:, 0]),
+        cost=np.asarray(episodes.cost_inputs.cost[:, 0]),
+        constraint_lidar=np.asarray(episodes.cost_inputs.constraint_lidar[:, 0]),
     )
 
 

@@ -18,11 +18,11 @@ from jax.sharding import PartitionSpec as P
 from autocost_jax.agents.base import Agent
 from autocost_jax.agents.cpo import cpo
 from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
-from autocost_jax.arrays import is_key
 from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import BANK, CostTerm
 from autocost_jax.envs.env import Env
 from autocost_jax.evaluate import Episodes, run_episodes, score
+from autocost_jax.files import is_key
 from autocost_jax.records import EvalResult, Key, Metrics, Slot, TrainingCost
 from autocost_jax.train import (
     Learner,

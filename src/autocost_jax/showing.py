@@ -9,9 +9,9 @@ from autocost_jax.commandline import parse, use_compile_cache
 
 def run_config(path: Path) -> Any:
     """The configuration of a run directory of either kind."""
-    from autocost_jax.methods import TableConfig
-    from autocost_jax.rundata import read_document
-    from autocost_jax.store import SearchConfig, read_config
+    from autocost_jax.runs.config_files import read_document
+    from autocost_jax.runs.directory import SearchConfig, read_config
+    from autocost_jax.runs.sweep import TableConfig
 
     config = read_document(path).get("config")
     is_table = isinstance(config, dict) and "methods" in config
@@ -37,7 +37,7 @@ def demo(argv: list[str]) -> None:
 
     options = parse(Options, argv, "autocost demo")
     use_compile_cache(options.compile_cache)
-    from autocost_jax.demo import write_demo
+    from autocost_jax.viz.demo import write_demo
 
     demo = write_demo(options.out, options.seed)
     for line in [*demo.lines, f"open {demo.page}"]:
@@ -83,8 +83,8 @@ def render(argv: list[str]) -> None:
     if (options.run is None) == (options.env is None):
         raise ValueError("give either --run DIR or --env NAME")
     use_compile_cache(options.compile_cache)
-    from autocost_jax.picture import film_size
-    from autocost_jax.render import best_policy, run_player, script_player, show
+    from autocost_jax.viz.picture import film_size
+    from autocost_jax.viz.render import best_policy, run_player, script_player, show
 
     if options.video is not None:
         film_size(options.video, options.size)  # refuses bad ones early
@@ -122,11 +122,9 @@ def report(argv: list[str]) -> None:
         out: Path | None = None
 
     options = parse(Options, argv, "autocost report")
-    from autocost_jax.report import write_report
-    from autocost_jax.summary import load_report
+    from autocost_jax.viz.run_data import write_run_report
 
-    out = options.out or options.run / "report" / "index.html"
-    print(write_report(load_report(options.run), out))
+    print(write_run_report(options.run, options.out))
 
 
 def envs(argv: list[str]) -> None:
@@ -148,8 +146,8 @@ def envs(argv: list[str]) -> None:
         seed: int = 0
 
     options = parse(Options, argv, "autocost envs")
-    from autocost_jax.env_config import ENVS
-    from autocost_jax.gallery import write_gallery
+    from autocost_jax.config import ENVS
+    from autocost_jax.viz.gallery import write_gallery
 
     names = options.names or tuple(ENVS)
     gallery = write_gallery(names, options.out, options.seed)

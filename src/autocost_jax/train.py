@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from autocost_jax.agents.advantages import weighted_mean
 from autocost_jax.agents.base import Agent
 from autocost_jax.config import TrainConfig
-from autocost_jax.costs import BANK, CostTerm, intrinsic_cost, total_cost
+from autocost_jax.costs import BANK, CostTerm, total_cost
 from autocost_jax.envs.env import Env
+from autocost_jax.metrics import cost_by_distance, episode_metrics
 from autocost_jax.records import EnvState, Key, Metrics, Slot, Trajectory
 from autocost_jax.rollout import (
     carry_cohorts,
@@ -166,8 +166,8 @@ def final_episodes(
     round is one episode of all k N worlds of a slot.
 
     Returns:
-      For each group metrics [num_rounds, P_g]: `episode_metrics`, `awareness`, and the
-      environment's counters.
+      For each group metrics [num_rounds, P_g]: `episode_metrics`, `cost_by_distance`,
+      and the environment's counters.
     """
     whole = dataclasses.replace(
         config,
@@ -183,7 +183,7 @@ def final_episodes(
         def one(slot: Slot, trajectory: Trajectory, counts: Metrics) -> Metrics:
             cost = trajectory.cost_inputs.cost
             metrics = episode_metrics(trajectory, cost, env.episode_length)
-            metrics |= awareness(trajectory, slot.cost.theta)
+            metrics |= cost_by_distance(trajectory, slot.cost.theta)
             return metrics | {name: jnp.mean(x) for name, x in counts.items()}
 
         return carry, tuple(
@@ -371,7 +371,7 @@ def _update(
     frozen = learner.frozen | ~healthy
     first = frozen & ~learner.frozen
     metrics["frozen"] = frozen.astype(jnp.float32)
-    metrics |= awareness(trajectory, slot.cost.theta)
+    metrics |= cost_by_distance(trajectory, slot.cost.theta)
     return Learner(
         agent=jax.tree.map(
             lambda old, new: jnp.where(frozen, old, new), learner.agent, updated
@@ -379,47 +379,6 @@ def _update(
         frozen=frozen,
         frozen_epoch=jnp.where(first, epoch, learner.frozen_epoch),
     ), metrics
-
-
-def episode_metrics(
-    trajectory: Trajectory, total: jax.Array, episode_length: int
-) -> Metrics:
-    """What one slot's episodes looked like, scalars.
-
-    `ep_return`, `ep_cost` (extrinsic) and `ep_total_cost` (what the learner sees) are
-    undiscounted episode sums, estimated as episode_length x the mean over valid steps:
-    for whole episodes exactly their mean. `violating_worlds` is the share of worlds
-    with an extrinsic cost > 0 in this epoch, `failed_worlds` their number.
-    """
-    cost, valid = trajectory.cost_inputs.cost, trajectory.valid
-    world_cost = jnp.sum(valid * cost, axis=0)
-    return {
-        "ep_return": episode_length * weighted_mean(trajectory.reward, valid),
-        "ep_cost": episode_length * weighted_mean(cost, valid),
-        "ep_total_cost": episode_length * weighted_mean(total, valid),
-        "violating_worlds": jnp.mean((world_cost > 0).astype(valid.dtype)),
-        "failed_worlds": jnp.sum(1.0 - valid[-1]),
-    }
-
-
-def awareness(trajectory: Trajectory, theta: jax.Array) -> Metrics:
-    """Mean intrinsic cost of visited states far from and near to constraint objects.
-
-    `intrinsic_far` is over D > 3 R, `intrinsic_near` over D < 1.5 R; NaN if no such
-    state was visited.
-    """
-    inputs = trajectory.cost_inputs
-    cost = intrinsic_cost(theta, inputs.constraint_lidar)
-
-    def mean(where: jax.Array) -> jax.Array:
-        weight = trajectory.valid * where
-        visited = jnp.sum(weight) > 0
-        return jnp.where(visited, weighted_mean(cost, weight), jnp.nan)
-
-    return {
-        "intrinsic_far": mean(inputs.distance > 3.0 * inputs.radius),
-        "intrinsic_near": mean(inputs.distance < 1.5 * inputs.radius),
-    }
 
 
 def _all_finite(tree: Any) -> jax.Array:

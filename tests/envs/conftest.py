@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from env_data import NUM_WORLDS, Compiled, compile_env, load
 
-from autocost_jax.env_config import EnvConfig, env_config
+from autocost_jax.config import EnvConfig, env_config
 from autocost_jax.records import EnvState
 
 

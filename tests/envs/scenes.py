@@ -9,9 +9,9 @@ import mujoco as untyped_mujoco
 import numpy as np
 from env_data import blank_layout, stack
 
-from autocost_jax.env_config import EnvConfig
+from autocost_jax.config import EnvConfig
 from autocost_jax.envs.env import Env
-from autocost_jax.envs.models import BOX_PARTS, scene_model
+from autocost_jax.envs.physics.models import BOX_PARTS, scene_model
 from autocost_jax.records import EnvState, Layout
 
 mujoco: Any = untyped_mujoco  # its compiled names have no stubs

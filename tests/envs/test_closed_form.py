@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from env_data import NUM_WORLDS, blank_layout, compile_env, states_at
 
-from autocost_jax.env_config import EnvConfig, env_config
-from autocost_jax.envs.closed_form import make_closed_form_world
+from autocost_jax.config import EnvConfig, env_config
 from autocost_jax.envs.env import make_env
-from autocost_jax.envs.world import make_world
+from autocost_jax.envs.physics.closed_form import make_closed_form_world
+from autocost_jax.envs.physics.world import make_world
 
 CONFIG = EnvConfig(physics="closed_form")
 # Rounding, after the yaw servo has multiplied it by -4 in each of ten substeps.

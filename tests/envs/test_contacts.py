@@ -15,15 +15,15 @@ import scenes
 from env_data import Compiled, blank_layout, compile_env, load
 from scenes import mujoco
 
-from autocost_jax.env_config import EnvConfig, env_config
-from autocost_jax.envs.models import (
+from autocost_jax.config import EnvConfig, env_config
+from autocost_jax.envs.physics.models import (
     BOX_PARTS,
     NEAREST,
     NEAREST_TO_BOX,
     physics_model,
     scene_model,
 )
-from autocost_jax.envs.world import make_world
+from autocost_jax.envs.physics.world import make_world
 from autocost_jax.records import Layout
 
 FLOAT64 = 1e-9

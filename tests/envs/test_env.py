@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from env_data import NUM_WORLDS
 
-from autocost_jax.env_config import ENVS, SUITE, EnvConfig
+from autocost_jax.config import ENVS, SUITE, EnvConfig
 from autocost_jax.envs.env import list_envs, make_env
 
 FLOAT32 = 1e-5

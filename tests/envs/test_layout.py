@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax.env_config import EnvConfig
+from autocost_jax.config import EnvConfig
 from autocost_jax.envs import layout as layouts
 from autocost_jax.envs.env import make_env
 from autocost_jax.records import Layout

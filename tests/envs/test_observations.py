@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from autocost_jax.env_config import ENVS, SUITE
+from autocost_jax.config import ENVS, SUITE
 from autocost_jax.envs.env import make_env
 
 # As Safety Gym flattens them, sorted by name; a lidar has as many numbers as bins.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax.env_config import ENVS, SUITE, env_config
+from autocost_jax.config import ENVS, SUITE, env_config
 from autocost_jax.envs import layout as layouts
 
 ROUNDING = 1e-6  # float32 distances of a few metres

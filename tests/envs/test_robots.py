@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from env_data import blank_layout, load, states_at
 
-from autocost_jax.env_config import EnvConfig, env_config
+from autocost_jax.config import EnvConfig, env_config
 from autocost_jax.envs.env import make_env
-from autocost_jax.envs.models import scene_model
+from autocost_jax.envs.physics.models import scene_model
 
 mujoco: Any = untyped_mujoco  # its compiled names have no stubs
 

@@ -11,8 +11,8 @@ from mujoco import mjx
 from scenes import mujoco
 
 from autocost_jax import env_config
-from autocost_jax.envs.models import physics_model
-from autocost_jax.envs.rows import build, inputs, make_rows
+from autocost_jax.envs.physics.models import physics_model
+from autocost_jax.envs.physics.rows import build, inputs, make_rows
 
 # Floor, box, pillars, joint limits, vases; capped and uncapped contacts.
 WORLDS = {

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax.env_config import ENVS, env_config
+from autocost_jax.config import ENVS, env_config
 from autocost_jax.envs.env import make_env
 
 NUM_WORLDS, NUM_STEPS, CHUNK = 256, 1000, 50

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from autocost_jax.envs.solver import (
+from autocost_jax.envs.physics.solver import (
     CPU_LANES,
     Problem,
     minimise,

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from env_data import NUM_WORLDS, float32_bound, load, stack, states_at
 
-from autocost_jax.env_config import env_config
+from autocost_jax.config import env_config
 from autocost_jax.envs.env import Env, make_env
-from autocost_jax.envs.models import scene_model
+from autocost_jax.envs.physics.models import scene_model
 from autocost_jax.envs.sensors import lidar
 from autocost_jax.records import EnvState, Layout
 

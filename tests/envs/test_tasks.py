@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from env_data import float32_bound, load
 
-from autocost_jax.env_config import EnvConfig
+from autocost_jax.config import EnvConfig
 from autocost_jax.envs.constraints import (
     distances_to,
     make_constraint,

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from env_data import NUM_WORLDS, blank_layout, load
 
-from autocost_jax.env_config import EnvConfig
-from autocost_jax.envs.models import load_spec
-from autocost_jax.envs.world import make_world
+from autocost_jax.config import EnvConfig
+from autocost_jax.envs.physics.models import load_spec
+from autocost_jax.envs.physics.world import make_world
 
 mujoco: Any = untyped_mujoco  # its compiled names have no stubs
 

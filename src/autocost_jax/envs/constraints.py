@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.env_config import EnvConfig
+from autocost_jax.config import EnvConfig
 from autocost_jax.records import Bodies, Layout
 
 

@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.env_config import ENVS, LIDAR_BINS, EnvConfig, env_config
+from autocost_jax.config import ENVS, LIDAR_BINS, EnvConfig, env_config
 from autocost_jax.envs import layout as layouts
-from autocost_jax.envs.closed_form import make_closed_form_world
 from autocost_jax.envs.constraints import Constraint, distances_to, make_constraint
+from autocost_jax.envs.physics.closed_form import make_closed_form_world
+from autocost_jax.envs.physics.world import World, make_world
 from autocost_jax.envs.sensors import flatten, lidar, slices
 from autocost_jax.envs.tasks import Task, make_task
-from autocost_jax.envs.world import World, make_world
 from autocost_jax.precision import full_precision
 from autocost_jax.records import (
     Bodies,

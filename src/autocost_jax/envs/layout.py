@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.env_config import EnvConfig
+from autocost_jax.config import EnvConfig
 from autocost_jax.records import Key, Layout
 
 NUM_CANDIDATES = 128  # draws for one object; Safety Gym makes up to 100

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from autocost_jax.env_config import EnvConfig
+from autocost_jax.config import EnvConfig
 from autocost_jax.records import Bodies, Layout
 
 

@@ -1,0 +1,1 @@
+"""How a world moves: MuJoCo's models, MJX, and equations of motion in closed form."""

@@ -1,1 +1,0 @@
-"""Parts of the report: its records, its figures, and the page's static text."""

@@ -1,0 +1,297 @@
+"""Methods x seeds trained together: a table of slots for the population program.
+
+A method is an algorithm and a training cost; a figure of the paper is a table of them.
+The run directory holds the configuration, metrics, checkpoints, the policy of every
+slot and their scores over fresh episodes.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from autocost_jax.runs import cluster
+from autocost_jax.agents.base import actor
+from autocost_jax.files import flatten
+from autocost_jax.config import Algorithm, TrainConfig
+from autocost_jax.costs import parse_cost, training_cost
+from autocost_jax.envs.env import make_env
+from autocost_jax.runs.policies import (
+    EVALUATION,
+    eval_summary,
+    load_policies,
+    require_episodes,
+    score_line,
+)
+from autocost_jax.population import (
+    Population,
+    make_agents,
+    make_evaluator,
+    make_population,
+    stack_slots,
+)
+from autocost_jax.runs.progress import Display, format_seconds
+from autocost_jax.records import Slot
+from autocost_jax.runs.loop import (
+    Chunk,
+    keep_chunks,
+    metric_rows,
+    output,
+    start,
+    useful_devices,
+)
+from autocost_jax.runs.directory import RunDir, open_run
+from autocost_jax.train import Learner
+
+Learners = Literal["ppo", "ppo_lagrangian", "cpo"]
+# PPO is a PPO-Lagrangian slot that ignores cost.
+GROUPS: tuple[Algorithm, ...] = ("ppo_lagrangian", "cpo")
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the table.
+
+    Attributes:
+      label: its name in files and tables.
+      algorithm: ppo, ppo_lagrangian or cpo.
+      cost: the training cost, see `costs.training_cost`.
+      limit: allowed training cost of an episode.
+      theta: the intrinsic network's parameters, if `cost` uses it.
+    """
+
+    label: str
+    algorithm: Learners = "ppo_lagrangian"
+    cost: str = "extrinsic"
+    limit: float = 0.0
+    theta: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.algorithm not in ("ppo", *GROUPS):
+            raise ValueError(
+                f"algorithm must be ppo, ppo_lagrangian or cpo, got {self.algorithm!r}"
+            )
+        theta = None if self.theta is None else np.asarray(self.theta)
+        parse_cost(self.cost, theta, self.limit)
+
+
+@dataclass(frozen=True)
+class TableConfig:
+    """What is trained: every method with every seed, side by side.
+
+    Attributes:
+      train: worlds, epochs and the learners' settings.
+      methods: the rows; labels are distinct, networks of one size.
+      seeds: one slot a method and seed.
+    """
+
+    train: TrainConfig = field(default_factory=TrainConfig)
+    methods: tuple[Method, ...] = ()
+    seeds: tuple[int, ...] = (0,)
+
+    def __post_init__(self) -> None:
+        labels = [method.label for method in self.methods]
+        if not labels or len(set(labels)) < len(labels):
+            raise ValueError(f"methods must have distinct labels, got {labels}")
+        sizes = {len(row.theta) for row in self.methods if row.theta is not None}
+        if len(sizes) > 1:
+            raise ValueError(
+                "the methods of a table must have cost networks of one size, "
+                f"got {sorted(sizes)} parameters"
+            )
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds must be distinct numbers, got {self.seeds}")
+
+    def group(self, name: str) -> list[tuple[Method, int]]:
+        """The slots of one algorithm group, in order."""
+        return [
+            (method, seed)
+            for method in self.methods
+            for seed in self.seeds
+            if (method.algorithm == "cpo") == (name == "cpo")
+        ]
+
+    @property
+    def algorithms(self) -> tuple[Algorithm, ...]:
+        """The groups that have slots."""
+        return tuple(name for name in GROUPS if self.group(name))
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps of the whole table."""
+        epoch = self.train.num_worlds * self.train.env.num_steps
+        slots = len(self.methods) * len(self.seeds)
+        return slots * self.train.num_epochs * epoch
+
+
+class TableState(struct.PyTreeNode):
+    """What a checkpoint holds.
+
+    Attributes:
+      learners: for each group, stacked [P, ...].
+      epoch: [] int32 epochs done.
+    """
+
+    learners: tuple[Learner, ...]
+    epoch: jax.Array
+
+
+def table_slots(config: TableConfig) -> tuple[Slot, ...]:
+    """The stacked slots of each group; the key of a slot is that of its seed."""
+    thetas = [row.theta for row in config.methods if row.theta is not None]
+    unused = np.zeros_like(thetas[0]) if thetas else None
+
+    def slot(method: Method, seed: int) -> Slot:
+        theta = unused if method.theta is None else np.asarray(method.theta)
+        return Slot(
+            cost=training_cost(method.cost, theta, method.limit),
+            key=jax.random.key(seed),
+            constrained=jnp.asarray(method.algorithm != "ppo", jnp.float32),
+        )
+
+    return tuple(
+        stack_slots([slot(method, seed) for method, seed in config.group(name)])
+        for name in config.algorithms
+    )
+
+
+def run_table(
+    config: TableConfig,
+    path: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    devices: Sequence[Any] | None = None,
+    num_episodes: int = 100,
+) -> list[dict[str, Any]]:
+    """Train and evaluate a table in a run directory, or resume it.
+
+    Args:
+      config: the table; on resume it must be the run's own, but for
+        `config_files.MAY_DIFFER`.
+      path: the run directory.
+      resume: continue from the newest whole checkpoint.
+      overwrite: start over in a directory that already holds a run.
+      devices: default: the first one.
+      num_episodes: fresh episodes a slot in the final evaluation.
+
+    Returns:
+      For each slot its method, seed and scores, as in evaluation.json; of several
+      processes only the first has them, the others return an empty list.
+
+    Raises:
+      RunDirError: the directory is not usable for this run.
+      DiskFullError: the disk is full; the directory is intact.
+    """
+    require_episodes(num_episodes)
+    slots = table_slots(config)
+    largest = max(group.key.shape[0] for group in slots)
+    devices = useful_devices(devices, largest, "slots of an algorithm")
+    env = make_env(config.train.env)
+    agents = make_agents(config.algorithms, config.train, env)
+    population = make_population(env, agents, config.train, devices=devices)
+    opened = open_run(path, config, resume=resume, overwrite=overwrite)
+    with opened as run, Display(config.env_steps, 0, output()) as display:
+        for line in run.warnings if run else ():
+            display.say(line)
+        display.say(
+            f"{env.config.name}: {len(config.methods)} methods x {len(config.seeds)} "
+            f"seeds, {config.env_steps:,} env steps on {len(devices)} device(s)"
+        )
+        state = TableState(population.init(slots), jnp.zeros((), jnp.int32))
+        state, resumed = start(run, path, state, display, resume)
+        if resumed:
+            display.say(f"resuming {path} after {int(state.epoch)} epochs")
+        chunks = _chunks(config, population, slots, state, display)
+        state = keep_chunks(run, chunks, state, population.fetch)
+        table = []
+        if run is not None:
+            table = _finish(run, config, state, display, num_episodes)
+        cluster.wait_for_all()
+        return table
+
+
+def _chunks(
+    config: TableConfig,
+    population: Population,
+    slots: tuple[Slot, ...],
+    state: TableState,
+    display: Display,
+) -> Iterator[Chunk]:
+    """Train chunk after chunk, and show each."""
+    chunk, total = config.train.chunk_epochs, config.train.num_epochs
+    begun, first = time.monotonic(), int(state.epoch)
+    learners = state.learners
+    for epoch in range(first, total, chunk):
+        after = epoch + chunk
+        learners, metrics = population.chunk(learners, slots, epoch)
+        metrics = jax.tree.map(np.asarray, population.fetch(metrics))
+        left = (time.monotonic() - begun) / (after - first) * (total - after)
+        named = zip(config.algorithms, metrics, strict=True)
+        display.say(
+            f"epoch {after}/{total}  "
+            + "  ".join(_line(config, name, group) for name, group in named)
+            + f"  time left {format_seconds(left)}"
+        )
+        rows = metric_rows(config.algorithms, metrics)
+        yield Chunk(
+            state=TableState(learners, jnp.asarray(after, jnp.int32)),
+            first=epoch,
+            rows=[row | {"epoch": epoch + k} for k, row in enumerate(rows)],
+            position={},
+            is_end=after >= total,
+        )
+
+
+def _line(config: TableConfig, name: str, metrics: dict[str, np.ndarray]) -> str:
+    """Return / cost of each method, means over its seeds."""
+    cells: dict[str, list[int]] = {}
+    for index, (method, _) in enumerate(config.group(name)):
+        cells.setdefault(method.label, []).append(index)
+    return "  ".join(
+        f"{label} {metrics['ep_return'][-1, index].mean():.1f}/"
+        f"{metrics['ep_cost'][-1, index].mean():.2f}"
+        for label, index in cells.items()
+    )
+
+
+def _finish(
+    run: RunDir,
+    config: TableConfig,
+    state: TableState,
+    display: Display,
+    num_episodes: int,
+) -> list[dict[str, Any]]:
+    """Save every policy, score it over fresh episodes, write evaluation.json."""
+    files, table = [], []
+    for i, name in enumerate(config.algorithms):
+        for index, (method, seed) in enumerate(config.group(name)):
+            params = jax.tree.map(
+                lambda leaf, i=i, index=index: leaf[index],
+                actor(state.learners[i].agent),
+            )
+            stem = f"{method.label}_seed{seed}"
+            files.append(run.write_policy(stem, flatten(params)))
+            frozen = int(state.learners[i].frozen_epoch[index])
+            row = {"method": method.label, "seed": seed, "frozen_epoch": frozen}
+            table.append(row)
+            if frozen >= 0:
+                display.say(f"{stem} met a non-finite number in epoch {frozen}")
+    display.say(f"evaluating {len(files)} policies over {num_episodes} episodes ...")
+    agent, states = load_policies(config.train, files)
+    env = make_env(config.train.env)
+    key = jax.random.key(EVALUATION)
+    results, _ = make_evaluator(env, agent, num_episodes)(states, key)
+    for i, row in enumerate(table):
+        row |= eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
+    run.write_json("evaluation", {"episodes": num_episodes, "rows": table})
+    for row in table:
+        display.say("  " + score_line(f"{row['method']} seed {row['seed']}", row))
+    display.say(f"done in {format_seconds(display.elapsed)}; see {run.path}")
+    return table

@@ -1,0 +1,1 @@
+"""What a run shows: scenes, replays, figures, the report."""

@@ -1,0 +1,90 @@
+"""`autocost demo`: two shipped policies side by side, without any training."""
+
+import dataclasses
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from autocost_jax.agents.base import actor
+from autocost_jax.config import AgentConfig, TrainConfig, env_config
+from autocost_jax.costs import load_cost
+from autocost_jax.envs.env import make_env
+from autocost_jax.evaluate import first_recording, watch_first
+from autocost_jax.files import load_arrays, unflatten
+from autocost_jax.population import make_agents, make_evaluator
+from autocost_jax.runs.policies import policy_states
+from autocost_jax.viz.cost_map import network_cost
+from autocost_jax.viz.report import write_comparison
+from autocost_jax.viz.scene import make_replay
+
+WORLD = "Goal-Hazard-Point"
+FOUND = "lidar_mlp"  # the best shipped cost of this world
+LABELS = {"extrinsic": "extrinsic cost alone", FOUND: f"with the cost {FOUND}"}
+
+
+class Demo(NamedTuple):
+    """What a demo shows.
+
+    Attributes:
+      page: the file to open.
+      lines: scores for people.
+    """
+
+    page: Path
+    lines: list[str]
+
+
+def demo_train() -> TrainConfig:
+    """The world and networks that the shipped policies were trained with."""
+    return TrainConfig(
+        env=dataclasses.replace(env_config(WORLD), physics="closed_form"),
+        agent=AgentConfig(hidden_sizes=(64, 64), normalize_obs=True),
+    )
+
+
+def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
+    """Replay CPO's agents under the extrinsic cost alone and under a found cost.
+
+    Args:
+      out: folder of the page.
+      seed: of the layouts, which both agents meet, and of the actions.
+      num_episodes: that the scores are of; the first is shown.
+    """
+    train = demo_train()
+    env = make_env(train.env)
+    (agent,) = make_agents(("cpo",), train, env)
+    like = actor(agent.init(jax.random.key(0)))
+    folder = resources.files("autocost_jax") / "pretrained" / "policies"
+    loaded = [
+        unflatten(load_arrays(Path(str(folder / f"{name}_cpo.npz")), None), like)
+        for name in LABELS
+    ]
+    acting, states = policy_states(
+        train, jax.tree.map(lambda *leaves: np.stack(leaves), *loaded)
+    )
+    evaluate = make_evaluator(env, acting, num_episodes, watch=watch_first)
+    result, episodes = evaluate(states, jax.random.key(seed))
+    theta = np.asarray(load_cost(FOUND))
+    replays, lines = [], []
+    for i, (name, label) in enumerate(LABELS.items()):
+        recording = first_recording(jax.tree.map(lambda x, i=i: x[i], episodes))
+        intrinsic = None
+        if name == FOUND:
+            intrinsic = network_cost(theta, recording.constraint_lidar)
+        title = f"CPO, {label}"
+        replay = make_replay(train.env, recording, intrinsic=intrinsic, label=title)
+        replays.append(replay)
+        lines.append(
+            f"{title}: return {float(result.ep_return[i].mean()):.1f}, "
+            f"{float(result.violation_rate[i]):.0%} of {num_episodes} episodes violate"
+        )
+    text = (
+        "The same world, the same learner, the same number of steps. Both robots drive "
+        "to goals; the discs are hazards, which cost something while one is inside. "
+        f"{lines[0]}. {lines[1]}."
+    )
+    page = write_comparison(replays, f"{WORLD}: two costs", text, out / "index.html")
+    return Demo(page, lines)
