@@ -1,0 +1,1 @@
+"""Runs on disk: the directory, checkpoints, and the loop that keeps them."""
