@@ -3,7 +3,7 @@
     python experiments/agreement.py run       # train every variant, the same seeds
     python experiments/agreement.py collect   # JSON, table, figure of what has run
 
-The plain variant is the closed-form Point with one segment an episode and float32
+The plain variant is the closed-form Point with one segment per episode and float32
 critics. The others change one thing: the physics engine, the cohorts, the critics'
 precision. `--only NAME ...` takes some variants, `--smoke` shrinks everything to a
 minute. Results are written to experiments/results/agreement/ (reduced scale).
@@ -21,7 +21,7 @@ from common import REDUCED, Options, compact, run_if_needed, run_part, t_interva
 from autocost_jax import TrainConfig, env_config, preset
 from autocost_jax.runs.config_files import to_json
 from autocost_jax.runs.directory import read_config, read_metrics, run_facts
-from autocost_jax.runs.sweep import Method, TableConfig
+from autocost_jax.runs.sweep import Method, SweepConfig
 
 PLAIN = "plain"
 # What differs from the plain variant: of the world, of the training, of the agent.
@@ -42,7 +42,7 @@ def run(options: Options) -> None:
     for name in options.only or VARIANTS:
         train = variant(name, options.smoke)
         seeds = SEEDS[:2] if options.smoke else SEEDS
-        config = TableConfig(train, methods, seeds)
+        config = SweepConfig(train, methods, seeds)
         episodes = 2 if options.smoke else EPISODES
         run_if_needed(config, folder(options, name), episodes)
 
@@ -107,7 +107,7 @@ def collect(options: Options) -> None:
 
 def collect_variant(path: Path) -> dict[str, Any]:
     """Scores of fresh episodes, one a seed, and the curves of each algorithm."""
-    config = read_config(path, TableConfig)[0]
+    config = read_config(path, SweepConfig)[0]
     evaluated = json.loads((path / "evaluation.json").read_text())
     rows = read_metrics(path)
     scores = {

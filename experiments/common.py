@@ -14,7 +14,7 @@ from autocost_jax.commandline import use_devices
 from autocost_jax.config import AgentConfig
 from autocost_jax.runs.config_files import first_difference
 from autocost_jax.runs.directory import read_config
-from autocost_jax.runs.sweep import TableConfig, run_table
+from autocost_jax.runs.sweep import SweepConfig, run_sweep
 
 # The learner of what is trained at reduced scale: smaller networks than the paper's,
 # minibatches in place of 80 full-batch steps, everything else as in the paper.
@@ -71,7 +71,7 @@ def run_part(
     parts[args.part](options)
 
 
-def run_if_needed(config: TableConfig, path: Path, num_episodes: int) -> None:
+def run_if_needed(config: SweepConfig, path: Path, num_episodes: int) -> None:
     """Train a table unless that is done; continue where it was stopped.
 
     Raises:
@@ -83,12 +83,12 @@ def run_if_needed(config: TableConfig, path: Path, num_episodes: int) -> None:
         return
     resume = (path / "config.yaml").exists()
     devices = jax.devices()
-    run_table(config, path, resume=resume, devices=devices, num_episodes=num_episodes)
+    run_sweep(config, path, resume=resume, devices=devices, num_episodes=num_episodes)
 
 
-def check_same(config: TableConfig, path: Path) -> None:
+def check_same(config: SweepConfig, path: Path) -> None:
     """End the program if a run directory is not that of a table."""
-    difference = first_difference(read_config(path, TableConfig)[0], config)
+    difference = first_difference(read_config(path, SweepConfig)[0], config)
     if difference is not None:
         name, old, new = difference
         raise SystemExit(f"{path} has {name}={old}, wanted {name}={new}: remove it")

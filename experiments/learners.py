@@ -31,7 +31,7 @@ from autocost_jax.envs.env import make_env
 from autocost_jax.evaluate import evaluate
 from autocost_jax.population import make_agents, make_population
 from autocost_jax.runs.directory import run_facts
-from autocost_jax.runs.sweep import Method, TableConfig, table_slots
+from autocost_jax.runs.sweep import Method, SweepConfig, sweep_slots
 
 STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
 COSTS = ("extrinsic", "extrinsic+safety_margin_2x", "extrinsic+safety_margin_3x")
@@ -61,7 +61,7 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 
 
-def config_of(name: str, steps: int = STEPS, episode: int = 1000) -> TableConfig:
+def config_of(name: str, steps: int = STEPS, episode: int = 1000) -> SweepConfig:
     """The table that one setting trains."""
     worlds, segments, changes = SETTINGS[name]
     train = TrainConfig(
@@ -76,7 +76,7 @@ def config_of(name: str, steps: int = STEPS, episode: int = 1000) -> TableConfig
         for algorithm in ("ppo_lagrangian", "cpo")
         for cost in COSTS
     )
-    return TableConfig(train=train, methods=methods, seeds=SEEDS)
+    return SweepConfig(train=train, methods=methods, seeds=SEEDS)
 
 
 def run_one(name: str, out: Path, smoke: bool) -> None:
@@ -87,7 +87,7 @@ def run_one(name: str, out: Path, smoke: bool) -> None:
     env = make_env(train.env)
     agents = make_agents(config.algorithms, train, env)
     population = make_population(env, agents, train, devices=devices)
-    slots = table_slots(config)
+    slots = sweep_slots(config)
     learners = population.init(slots)
     start = time.monotonic()
     for epoch in range(train.num_epochs):

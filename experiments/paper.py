@@ -32,7 +32,7 @@ from autocost_jax.commandline import use_compile_cache, use_devices
 from autocost_jax.config import Algorithm
 from autocost_jax.runs.config_files import to_json
 from autocost_jax.runs.directory import read_config, read_metrics, run_facts
-from autocost_jax.runs.sweep import Learners, Method, TableConfig
+from autocost_jax.runs.sweep import AlgorithmName, Method, SweepConfig
 
 RESULTS = Path("experiments/results")
 WORLD, CROWDED = "Goal-Hazard-Point", "Goal-Hazard8-Point"
@@ -48,7 +48,7 @@ class Design(NamedTuple):
     Attributes:
       title: in legends and tables.
       cost: terms of the cost bank.
-      limit: allowed cost of an episode.
+      limit: allowed cost per episode.
       found: key of the intrinsic network in `Scale.found`, if `cost` uses one.
       algorithms: that are trained with it.
     """
@@ -57,7 +57,7 @@ class Design(NamedTuple):
     cost: str = "extrinsic"
     limit: float = 0.0
     found: str = ""
-    algorithms: tuple[Learners, ...] = BOTH
+    algorithms: tuple[AlgorithmName, ...] = BOTH
 
 
 WITH_NETWORK = "extrinsic+intrinsic"
@@ -184,7 +184,7 @@ class Figure(NamedTuple):
     curves: tuple[str, ...] = ("ep_return", "ep_cost")
 
 
-def table(world: str, designs: Sequence[str], scale: Scale) -> TableConfig:
+def table(world: str, designs: Sequence[str], scale: Scale) -> SweepConfig:
     """What is trained for some designs in one world."""
     env = env_config(world)
     if world in FOLDERS:  # equal to MJX to rounding, and faster
@@ -198,7 +198,7 @@ def table(world: str, designs: Sequence[str], scale: Scale) -> TableConfig:
         num_epochs=epochs,
     )
     rows = tuple(row for design in designs for row in methods(design, scale))
-    return TableConfig(train, rows, scale.seeds)
+    return SweepConfig(train, rows, scale.seeds)
 
 
 def methods(design: str, scale: Scale) -> tuple[Method, ...]:
@@ -283,7 +283,7 @@ def find(runs: Path, world: str, design: str, scale: Scale) -> Trained | None:
     """The finished run that holds a design, whatever else was trained in it."""
     wanted = table(world, [design], scale)
     for file in sorted((runs / world).glob("*/evaluation.json")):
-        config = read_config(file.parent, TableConfig)[0]
+        config = read_config(file.parent, SweepConfig)[0]
         labels = {content(method): method.label for method in config.methods}
         same = (config.train, config.seeds) == (wanted.train, wanted.seeds)
         if same and all(content(method) in labels for method in wanted.methods):
@@ -294,7 +294,7 @@ def find(runs: Path, world: str, design: str, scale: Scale) -> Trained | None:
 
 def scores(trained: Trained) -> dict[str, Any]:
     """Of a trained design: for each algorithm its scores, and its curves."""
-    config, facts = read_config(trained.path, TableConfig)
+    config, facts = read_config(trained.path, SweepConfig)
     rows = json.loads((trained.path / "evaluation.json").read_text())["rows"]
     metrics = read_metrics(trained.path)
     result: dict[str, Any] = {}

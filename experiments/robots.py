@@ -2,7 +2,7 @@
 
     python experiments/robots.py runs           # PPO, PPO-Lagrangian, CPO everywhere
     python experiments/robots.py beats-random   # PPO against policies that know nothing
-    python experiments/robots.py limit25        # 25 steps in hazards an episode
+    python experiments/robots.py limit25        # 25 steps in hazards per episode
     python experiments/robots.py collect        # JSON, tables, figures of what has run
 
 Each part can be stopped and started again; finished runs are kept. `--only NAME ...`
@@ -28,7 +28,7 @@ from autocost_jax.population import make_agents, make_evaluator
 from autocost_jax.runs.config_files import to_json
 from autocost_jax.runs.directory import read_config, read_metrics, run_facts
 from autocost_jax.runs.policies import EVALUATION, eval_summary
-from autocost_jax.runs.sweep import Learners, Method, TableConfig, table_slots
+from autocost_jax.runs.sweep import AlgorithmName, Method, SweepConfig, sweep_slots
 from autocost_jax.train import init_learner
 
 
@@ -42,7 +42,7 @@ class LimitTable(NamedTuple):
       seeds: one slot each.
     """
 
-    algorithms: tuple[Learners, ...]
+    algorithms: tuple[AlgorithmName, ...]
     worlds: int
     epochs: int
     seeds: tuple[int, ...]
@@ -76,7 +76,7 @@ RANDOM_SIZES = {
 }
 SEEDS, EPISODES = (0, 1, 2), 50
 
-# 25 steps in hazards an episode. All algorithms; PPO-Lagrangian for long enough that
+# 25 steps in hazards per episode. All algorithms; PPO-Lagrangian for long enough that
 # its multiplier comes to rest; CPO with enough episodes an epoch for a cost gradient.
 LIMIT, LIMIT_EPISODES = 25.0, 100
 LIMIT_TABLES = {
@@ -94,7 +94,7 @@ def run_all(options: Options) -> None:
     methods = tuple(Method(name, name) for name in ALGORITHMS)
     for name, worlds in chosen(RUN_WORLDS, options).items():
         train = sized(env_config(name), worlds, RUN_EPOCHS, options)
-        config = TableConfig(train, methods, RUN_SEEDS)
+        config = SweepConfig(train, methods, RUN_SEEDS)
         run_if_needed(config, options.runs / f"runs_{name}", RUN_EPISODES)
 
 
@@ -103,7 +103,7 @@ def run_beats_random(options: Options) -> None:
     episodes = 2 if options.smoke else EPISODES
     for name, (worlds, epochs) in chosen(RANDOM_SIZES, options).items():
         train = sized(env_config(name), worlds, epochs, options)
-        config = TableConfig(train, (Method("ppo", "ppo"),), SEEDS)
+        config = SweepConfig(train, (Method("ppo", "ppo"),), SEEDS)
         path = options.runs / f"random_{name}"
         run_if_needed(config, path, episodes)
         if not (path / "random.json").exists():
@@ -119,7 +119,7 @@ def run_limit(options: Options) -> None:
     for name, (algorithms, worlds, epochs, seeds) in LIMIT_TABLES.items():
         train = sized(env, worlds, epochs, options)
         methods = tuple(Method(name, name, limit=LIMIT) for name in algorithms)
-        config = TableConfig(train, methods, seeds)
+        config = SweepConfig(train, methods, seeds)
         run_if_needed(config, options.runs / name, episodes)
 
 
@@ -140,14 +140,14 @@ def sized(env: EnvConfig, worlds: int, epochs: int, options: Options) -> TrainCo
     return TrainConfig(env=env, agent=REDUCED, num_worlds=worlds, num_epochs=epochs)
 
 
-def evaluate_random(config: TableConfig, num_episodes: int) -> list[dict[str, Any]]:
+def evaluate_random(config: SweepConfig, num_episodes: int) -> list[dict[str, Any]]:
     """Scores of the untrained networks and of uniform actions, one row a seed.
 
-    They meet the layouts on which `run_table` scores the trained policies.
+    They meet the layouts on which `run_sweep` scores the trained policies.
     """
     env = make_env(config.train.env)
     (learner,) = make_agents(("ppo_lagrangian",), config.train, env)
-    (slots,) = table_slots(config)
+    (slots,) = sweep_slots(config)
     fresh = jax.vmap(lambda slot: init_learner(learner, slot).agent)(slots)
 
     def policy(state: Any, obs: jax.Array, key: jax.Array, deterministic: bool = False):
@@ -177,7 +177,7 @@ def evaluate_random(config: TableConfig, num_episodes: int) -> list[dict[str, An
 
 def collect_run(path: Path) -> dict[str, Any]:
     """What was run, whether anything broke, and the curves of each slot."""
-    config, facts = read_config(path, TableConfig)
+    config, facts = read_config(path, SweepConfig)
     rows = read_metrics(path)
     broken = failed = frozen = 0
     for row in rows:

@@ -68,7 +68,7 @@ def render_random(runs: dict[str, Any]) -> list[str]:
 def render_limit(tables: dict[str, Any]) -> list[str]:
     """Cost at the end of training and of fresh episodes, and CPO's own record."""
     lines = [
-        "| steps in hazards an episode | limit | worlds x epochs, seeds "
+        "| steps in hazards per episode | limit | worlds x epochs, seeds "
         "| cost, last fifth of training | cost, fresh episodes "
         "| return, fresh episodes | mean KL | multiplier: first, peak, last |",
         "|---|---|---|---|---|---|---|---|",
@@ -191,7 +191,7 @@ def draw_limit(tables: dict[str, Any], file: Path) -> None:
         band(cost, run, "ep_cost")
         limit = max(row["limit"] for row in run["methods"].values())
         cost.axhline(limit, color="k", ls="--", lw=1, label="limit")
-        cost.set(ylabel="steps in hazards an episode", ylim=(0, None))
+        cost.set(ylabel="steps in hazards per episode", ylim=(0, None))
         cost.set_title(f"{run['worlds']} worlds, {len(run['seeds'])} seeds", fontsize=9)
         cost.legend(fontsize=8)
     run = tables["limit25"]

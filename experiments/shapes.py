@@ -52,7 +52,7 @@ class Shape(NamedTuple):
       multiple: m, radii from the centre of an object to where it falls silent.
       height: h, the cost of a step for each metre inside, or of each step inside.
       constant: added everywhere.
-      limit: allowed training cost of an episode.
+      limit: allowed training cost per episode.
     """
 
     kind: str
@@ -120,7 +120,7 @@ MARKERS = {"margin_2x": "D", "evolved": "*", "evolved_dense": "P"}  # of `margin
 def slot(shape: Shape, seed: int) -> Slot:
     """What trains one shape with one seed."""
     terms = f"extrinsic+{shape.height}*{shape.kind}+{shape.constant}*constant"
-    theta = np.zeros(THETA_SIZES["nearest"])
+    theta = np.zeros(THETA_SIZES["min_distance"])
     theta[0] = shape.multiple
     cost = training_cost(terms, theta, shape.limit, SHAPES)
     return Slot(cost, jax.random.key(seed), jnp.ones(()))

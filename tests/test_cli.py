@@ -8,7 +8,7 @@ import pytest
 from autocost_jax.cli import main
 from autocost_jax.config import preset
 from autocost_jax.runs.directory import RunDir, read_metrics
-from autocost_jax.runs.sweep import Method, TableConfig, table_slots
+from autocost_jax.runs.sweep import Method, SweepConfig, sweep_slots
 
 TRAIN = ["train", "--preset", "smoke", "--episodes", "3"]
 
@@ -51,7 +51,7 @@ def asked(monkeypatch):
     """The tables that the command line would train."""
     tables = []
     monkeypatch.setattr(
-        "autocost_jax.runs.sweep.run_table",
+        "autocost_jax.runs.sweep.run_sweep",
         lambda config, *_, **__: tables.append(config),
     )
     return tables
@@ -156,15 +156,15 @@ def test_report_of_a_table_is_refused_in_one_line(trained, capsys):
 
 
 def test_slots_of_a_table_follow_its_rows():
-    config = TableConfig(
+    config = SweepConfig(
         methods=(Method("a", "ppo"), Method("b", "cpo", limit=-1.0)), seeds=(4, 5)
     )
     assert config.algorithms == ("ppo_lagrangian", "cpo")
-    ppo, cpo = table_slots(config)
+    ppo, cpo = sweep_slots(config)
     np.testing.assert_array_equal(ppo.constrained, [0.0, 0.0])
     np.testing.assert_array_equal(cpo.cost.limit, [-1.0, -1.0])
     with pytest.raises(ValueError, match="distinct labels"):
-        TableConfig(methods=(Method("a"), Method("a")))
+        SweepConfig(methods=(Method("a"), Method("a")))
 
 
 def test_networks_of_a_table_have_one_size():
@@ -173,6 +173,6 @@ def test_networks_of_a_table_have_one_size():
     methods = [Method("plain")]
     methods += [Method(f"{n}", cost=cost, theta=(0.5,) * n) for n in (13, 41)]
     with pytest.raises(ValueError, match=r"one size, got \[13, 41\]"):
-        TableConfig(methods=tuple(methods))
-    (slots,) = table_slots(TableConfig(methods=tuple(methods[:2])))
+        SweepConfig(methods=tuple(methods))
+    (slots,) = sweep_slots(SweepConfig(methods=tuple(methods[:2])))
     np.testing.assert_array_equal(slots.cost.theta, [[0.0] * 13, [0.5] * 13])

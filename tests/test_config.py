@@ -253,7 +253,7 @@ PROMISED = {
         "nets": (16, 16),
     },
 }
-EPOCHS = {"laptop": 40, "search": 64, "paper": 333, "smoke": 2}
+EPOCHS = {"laptop": 38, "search": 64, "paper": 333, "smoke": 2}
 FITNESS_EPOCHS = {"laptop": 12, "search": 16, "paper": 10, "smoke": 1}
 
 
@@ -312,12 +312,12 @@ def test_an_unknown_preset_is_answered_with_the_known_ones():
 
 NO_BACKEND = """
 from jax._src import xla_bridge
-from autocost_jax.runs.sweep import Method, TableConfig
+from autocost_jax.runs.sweep import Method, SweepConfig
 from autocost_jax.config import PRESETS
 from autocost_jax.runs.config_files import from_dict, to_dict
 theta = tuple([0.0] * 41)
 methods = (Method("a", "cpo", "extrinsic+intrinsic", 0.0, theta),)
-table = TableConfig(train=PRESETS["smoke"].train, methods=methods)
+table = SweepConfig(train=PRESETS["smoke"].train, methods=methods)
 for config in (table, *PRESETS.values()):
     assert from_dict(type(config), to_dict(config)) == config
 assert not xla_bridge.backends_are_initialized()

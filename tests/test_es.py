@@ -156,7 +156,7 @@ def test_a_lucky_retraining_is_no_zero_violation(key):
 # Where a search begins -------------------------------------------------------
 
 
-@pytest.mark.parametrize("network", ["dense", "nearest"])
+@pytest.mark.parametrize("network", ["lidar_mlp", "min_distance"])
 def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network, places):
     theta = graded_start(key, 200, 8.0, places, network)
     costs = np.asarray(jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta))

@@ -498,10 +498,9 @@ def test_success_is_judged_against_the_extrinsic_cost_for_each_algorithm():
     history = make_history(jnp.zeros((3, 2, 6)), ep_return)
     history["violating_worlds"] = jnp.broadcast_to(jnp.array(rates), (3, 2, 6))
     result = stage_result(FINALS, jnp.zeros((4, 41)), history, jnp.zeros((2, 6), bool))
-    far = [2 * np.log(100), 0.0, np.log(0.8 / 0.2), 0.0]
-    means = [0.0, 0.15, 0.4, 0.075]
-    np.testing.assert_allclose(result.fitness.cost, np.add(far, means), rtol=1e-5)
-    assert result.order.tolist() == [3, 1, 2, 0]
+    far = [2 * (0.3 + 0.5) / 0.3, 0.0, 1.0, 0.0]
+    np.testing.assert_allclose(result.fitness.cost, far, rtol=1e-5)
+    assert result.order.tolist() == [1, 3, 2, 0]  # of two that succeed the bolder one
     assert result.references["ep_return"].tolist() == [[10.0, 1.0]] * 2
 
 
@@ -514,7 +513,7 @@ def test_a_broken_reference_sets_no_bars():
     result = stage_result(config, jnp.zeros((4, 41)), history, frozen)
     np.testing.assert_array_equal(result.references["ep_return"][:, 0], [9.0, np.nan])
     bar = 0.3 * 9.0  # of PPO-Lagrangian alone
-    far = np.log(bar / np.array([0.5, 2.5, bar, bar]))
+    far = 1 - np.array([0.5, 2.5, bar, bar]) / bar
     np.testing.assert_allclose(result.fitness.cost, far, rtol=1e-5, atol=1e-6)
 
 

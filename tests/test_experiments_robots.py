@@ -8,7 +8,7 @@ import pytest
 
 from autocost_jax import TrainConfig
 from autocost_jax.runs.directory import RunDir
-from autocost_jax.runs.sweep import Method, TableConfig
+from autocost_jax.runs.sweep import Method, SweepConfig
 from scripts import load_script
 
 ROOT = Path(__file__).parents[1]
@@ -24,7 +24,7 @@ def robots():
 @pytest.fixture
 def run(tmp_path):
     """A run of two epochs and two seeds, of which every number is known."""
-    config = TableConfig(
+    config = SweepConfig(
         TrainConfig(num_worlds=2, num_epochs=2),
         (Method("cpo", "cpo", limit=25.0),),
         (0, 1),
@@ -74,7 +74,7 @@ def test_a_state_never_visited_is_no_broken_number(robots, run):
 def test_everything_that_breaks_is_counted(robots, run, broken, count):
     file = run / "metrics.jsonl"
     first, last = map(json.loads, file.read_text().splitlines())
-    with RunDir.open(run, robots.read_config(run, TableConfig)[0]) as opened:
+    with RunDir.open(run, robots.read_config(run, SweepConfig)[0]) as opened:
         opened.truncate_metrics(0)
         opened.log_metrics(first, 0)
         opened.log_metrics(last | {f"cpo/{k}": v for k, v in broken.items()}, 1)

@@ -20,7 +20,7 @@ from autocost_jax.files import flatten
 from autocost_jax.population import make_agents
 from autocost_jax.runs.directory import RunDir
 from autocost_jax.runs.policies import SCRIPTS, scripted_agent
-from autocost_jax.runs.sweep import Method, TableConfig
+from autocost_jax.runs.sweep import Method, SweepConfig
 from autocost_jax.viz import gallery, picture, scene
 from autocost_jax.viz.picture import FILMS, FPS, MOST_FRAMES, Job, film_frames
 from autocost_jax.viz.player import replay_page
@@ -125,7 +125,7 @@ def run_dir(tmp_path_factory):
     """A run directory with one untrained policy, as `autocost train` leaves it."""
     path = tmp_path_factory.mktemp("run") / "train"
     train = preset("smoke").train
-    config = TableConfig(train=train, methods=(Method("ppo", "ppo"),), seeds=(0,))
+    config = SweepConfig(train=train, methods=(Method("ppo", "ppo"),), seeds=(0,))
     (agent,) = make_agents(("ppo_lagrangian",), train, make_env(train.env))
     with RunDir.create(path, config) as run:
         run.write_policy("ppo_seed0", flatten(actor(agent.init(jax.random.key(0)))))

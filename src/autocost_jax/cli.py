@@ -71,7 +71,7 @@ def _train(argv: list[str]) -> None:
           env: one of the worlds that `autocost info` lists.
           algorithms: ppo, ppo_lagrangian, cpo: one method each.
           cost: terms of the cost bank, such as "extrinsic+0.1*safety_margin_2x".
-          limit: allowed training cost of an episode.
+          limit: allowed training cost per episode.
           theta: cost.npz with the intrinsic network, if the cost uses it; or the name
             of one that `autocost info` lists.
           num_seeds: seeds 0 ... N - 1.
@@ -118,13 +118,13 @@ def _train(argv: list[str]) -> None:
     # Before anything of JAX runs:
     group = (options.coordinator, options.num_processes, options.process_id)
     devices = use_devices(options.devices, *group)
-    from autocost_jax.runs.sweep import Method, TableConfig, run_table
+    from autocost_jax.runs.sweep import Method, SweepConfig, run_sweep
 
     if recorded is not None:
         config = replace(recorded, train=options.train)
     else:
         theta = _theta(options.theta)
-        config = TableConfig(
+        config = SweepConfig(
             train=options.train,
             methods=tuple(
                 Method(name, name, options.cost, options.limit, theta)
@@ -132,7 +132,7 @@ def _train(argv: list[str]) -> None:
             ),
             seeds=tuple(range(options.num_seeds)),
         )
-    run_table(
+    run_sweep(
         config,
         options.out,
         resume=options.resume,
@@ -152,10 +152,10 @@ def _train_defaults(argv: list[str], out: Path) -> tuple[Any, Any]:
     name, recorded = flag(argv, "--preset"), None
     if switch(argv, "--resume"):
         from autocost_jax.runs.config_files import read_config
-        from autocost_jax.runs.sweep import TableConfig
+        from autocost_jax.runs.sweep import SweepConfig
 
         named = flag(argv, "--out")
-        recorded, _ = read_config(out if named is None else named, TableConfig)
+        recorded, _ = read_config(out if named is None else named, SweepConfig)
     source = preset(name or "laptop") if recorded is None or name else recorded
     return recorded, with_env(source.train, argv)
 

@@ -159,7 +159,7 @@ def training_cost(
     Args:
       method: terms of the bank joined by "+", each with an optional "weight*".
       theta: [D] parameters of the intrinsic network; required if the method uses it.
-      limit: allowed cost of an episode.
+      limit: allowed cost per episode.
       bank: the cost terms that `method` may name.
 
     Raises:
@@ -211,7 +211,7 @@ def parse_cost(
             raise ValueError(
                 f"method {method!r} needs the parameters of a cost (theta)"
             )
-        theta = np.zeros(THETA_SIZES["dense"], np.float32)
+        theta = np.zeros(THETA_SIZES["lidar_mlp"], np.float32)
     if not _is_theta(np.shape(theta)):
         raise ValueError(f"theta must have {_SIZES} parameters, got {np.shape(theta)}")
     return weights, theta

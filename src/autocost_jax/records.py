@@ -172,7 +172,7 @@ class TrainingCost(struct.PyTreeNode):
     Attributes:
       weights: [K] weight of each term of the cost bank.
       theta: [D] parameters of the intrinsic cost network.
-      limit: [] allowed cost of an episode (undiscounted sum).
+      limit: [] allowed cost per episode (undiscounted sum).
     """
 
     weights: jax.Array

@@ -11,11 +11,11 @@ def run_config(path: Path) -> Any:
     """The configuration of a run directory of either kind."""
     from autocost_jax.runs.config_files import read_document
     from autocost_jax.runs.directory import SearchConfig, read_config
-    from autocost_jax.runs.sweep import TableConfig
+    from autocost_jax.runs.sweep import SweepConfig
 
     config = read_document(path).get("config")
     is_table = isinstance(config, dict) and "methods" in config
-    return read_config(path, TableConfig if is_table else SearchConfig)[0]
+    return read_config(path, SweepConfig if is_table else SearchConfig)[0]
 
 
 def demo(argv: list[str]) -> None:

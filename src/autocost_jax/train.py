@@ -37,7 +37,7 @@ class Learner(struct.PyTreeNode):
       frozen: [] bool; True once anything of it was non-finite. `agent` is then the
         last finite state.
       frozen_epoch: [] int32 epoch in which that happened, else -1.
-      worlds: [(k - 1) N, ...] its older cohorts; None for one segment an episode.
+      worlds: [(k - 1) N, ...] its older cohorts; None for one segment per episode.
     """
 
     agent: Any

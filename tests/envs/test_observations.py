@@ -141,7 +141,7 @@ def test_the_suite(name):
 
 
 def test_control_periods():
-    """0.02, 0.04, 0.1 s, and 1000 steps an episode."""
+    """0.02, 0.04, 0.1 s, and 1000 steps per episode."""
     periods = {"Point": 0.02, "Car": 0.04, "Doggo": 0.1}
     for robot, period in periods.items():
         env = make_env(f"Goal-Hazard-{robot}")

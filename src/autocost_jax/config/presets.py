@@ -38,7 +38,7 @@ PRESETS: dict[str, SearchConfig] = {
             env=EnvConfig(physics="closed_form"),
             agent=_LAPTOP_AGENT,
             num_worlds=8,
-            num_epochs=40,
+            num_epochs=38,
             chunk_epochs=2,
         ),
         population_size=19,

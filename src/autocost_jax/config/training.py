@@ -23,8 +23,8 @@ Selection = Literal["paper", "random"]
 Start = Literal["normal", "graded"]
 Judge = Literal["cost", "success"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
-CostNetwork = Literal["dense", "nearest"]
-THETA_SIZES: dict[CostNetwork, int] = {"dense": 41, "nearest": 13}
+CostNetwork = Literal["lidar_mlp", "min_distance"]
+THETA_SIZES: dict[CostNetwork, int] = {"lidar_mlp": 41, "min_distance": 13}
 
 
 @dataclass(frozen=True)
@@ -189,8 +189,9 @@ class SearchConfig:
     them. After the last stage the `num_finalists` best are trained from scratch with
     `final_seeds` fresh seeds for `final_epochs` epochs (0: as many as in a stage), the
     references beside them.
-    With `network="nearest"` candidates are networks of 13 parameters that see only how
-    near the closest object is, see `costs.intrinsic_logit`; "dense" is the paper's.
+    With `network="min_distance"` candidates are networks of 13 parameters that see only
+    how near the closest object is, see `costs.intrinsic_logit`; "lidar_mlp" is the
+    paper's.
     """
 
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -208,7 +209,7 @@ class SearchConfig:
     zero_tolerance: float = 0.0
     selection: Selection = "paper"
     start: Start = "normal"
-    network: CostNetwork = "dense"
+    network: CostNetwork = "lidar_mlp"
     seeds_per_candidate: int = 1
     references: bool = False
     judge_by: Judge = "cost"

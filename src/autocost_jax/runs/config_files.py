@@ -21,8 +21,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 import jax
 import numpy as np
 
-from autocost_jax.files import RunDirError
 from autocost_jax.config import SearchConfig
+from autocost_jax.files import RunDirError
 
 C = TypeVar("C")
 FORMAT = "autocost_jax run 1"

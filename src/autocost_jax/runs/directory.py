@@ -23,8 +23,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from autocost_jax.runs import checkpoints
-from autocost_jax.runs import cluster
+from autocost_jax.config import SearchConfig
 from autocost_jax.files import (
     TEMPORARY,
     ArraySpec,
@@ -39,8 +38,8 @@ from autocost_jax.files import (
     save_arrays,
     write_atomic,
 )
+from autocost_jax.runs import checkpoints, cluster
 from autocost_jax.runs.checkpoints import Checkpoint, estimate_bytes
-from autocost_jax.config import SearchConfig
 from autocost_jax.runs.config_files import (
     CONFIG,
     FORMAT,

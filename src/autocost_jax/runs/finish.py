@@ -1,6 +1,5 @@
 """The end of a search: finalists judged, the best cost named."""
 
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -8,10 +7,11 @@ import numpy as np
 
 from autocost_jax import es as es_lib
 from autocost_jax.agents.base import Actor, actor
-from autocost_jax.files import flatten
 from autocost_jax.config import SearchConfig
 from autocost_jax.es import Fitness
-from autocost_jax.search.evolution import SearchState, best_of, pick_label
+from autocost_jax.files import flatten
+from autocost_jax.records import Key
+from autocost_jax.runs.directory import RunDir
 from autocost_jax.runs.outcome import (
     BEST,
     compared,
@@ -26,9 +26,8 @@ from autocost_jax.runs.outcome import (
     table_lines,
 )
 from autocost_jax.runs.policies import EVALUATION, load_policies, policy_name
-from autocost_jax.runs.progress import Display, format_seconds
-from autocost_jax.records import Key
-from autocost_jax.runs.directory import RunDir
+from autocost_jax.runs.progress import Display
+from autocost_jax.search.evolution import SearchState, best_of, pick_label
 
 
 def finish(

@@ -14,11 +14,11 @@ import numpy as np
 from autocost_jax.agents.base import Actor, actor
 from autocost_jax.config import SearchConfig, TrainConfig
 from autocost_jax.envs.env import make_env
-from autocost_jax.runs.policies import policy_states
+from autocost_jax.evaluate import Recording, first_recording, watch_first
 from autocost_jax.population import make_evaluator
 from autocost_jax.records import EvalResult, Key, Metrics
 from autocost_jax.runs.labels import COST_LABELS, algorithm_label
-from autocost_jax.evaluate import Recording, first_recording, watch_first
+from autocost_jax.runs.policies import policy_states
 from autocost_jax.search.stages import REFERENCES, deal
 from autocost_jax.search.success import (
     RETURN_KEPT,

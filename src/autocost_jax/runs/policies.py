@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.agents.base import Actor, Agent, actor
-from autocost_jax.files import RunDirError, load_arrays, unflatten
 from autocost_jax.config import TrainConfig
 from autocost_jax.envs.env import Env, make_env
+from autocost_jax.files import RunDirError, load_arrays, unflatten
 from autocost_jax.population import make_agents
 from autocost_jax.records import EvalResult, Key
 

@@ -11,22 +11,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.runs import cluster
 from autocost_jax.agents.base import actor
-from autocost_jax.files import flatten
 from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import make_env
-from autocost_jax.search.evolution import (
-    Progress,
-    Searcher,
-    SearchState,
-    evolve,
-    init_search,
-    make_searcher,
-    require_survivors,
-    slots_of,
-)
+from autocost_jax.files import flatten
+from autocost_jax.runs import cluster
+from autocost_jax.runs.directory import RunDir, open_run
 from autocost_jax.runs.finish import finish
+from autocost_jax.runs.loop import (
+    Chunk,
+    keep_chunks,
+    metric_rows,
+    output,
+    start,
+    useful_devices,
+)
 from autocost_jax.runs.policies import (
     policy_name,
     require_episodes,
@@ -37,16 +36,17 @@ from autocost_jax.runs.progress import (
     stage_lines,
     summarise,
 )
-from autocost_jax.search.stages import StageResult
-from autocost_jax.runs.directory import RunDir, open_run
-from autocost_jax.runs.loop import (
-    Chunk,
-    keep_chunks,
-    metric_rows,
-    output,
-    start,
-    useful_devices,
+from autocost_jax.search.evolution import (
+    Progress,
+    Searcher,
+    SearchState,
+    evolve,
+    init_search,
+    make_searcher,
+    require_survivors,
+    slots_of,
 )
+from autocost_jax.search.stages import StageResult
 from autocost_jax.train import slots_at_once
 
 

@@ -16,19 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from autocost_jax.runs import cluster
 from autocost_jax.agents.base import actor
-from autocost_jax.files import flatten
 from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import parse_cost, training_cost
 from autocost_jax.envs.env import make_env
-from autocost_jax.runs.policies import (
-    EVALUATION,
-    eval_summary,
-    load_policies,
-    require_episodes,
-    score_line,
-)
+from autocost_jax.files import flatten
 from autocost_jax.population import (
     Population,
     make_agents,
@@ -36,8 +28,9 @@ from autocost_jax.population import (
     make_population,
     stack_slots,
 )
-from autocost_jax.runs.progress import Display, format_seconds
 from autocost_jax.records import Slot
+from autocost_jax.runs import cluster
+from autocost_jax.runs.directory import RunDir, open_run
 from autocost_jax.runs.loop import (
     Chunk,
     keep_chunks,
@@ -46,10 +39,17 @@ from autocost_jax.runs.loop import (
     start,
     useful_devices,
 )
-from autocost_jax.runs.directory import RunDir, open_run
+from autocost_jax.runs.policies import (
+    EVALUATION,
+    eval_summary,
+    load_policies,
+    require_episodes,
+    score_line,
+)
+from autocost_jax.runs.progress import Display, format_seconds
 from autocost_jax.train import Learner
 
-Learners = Literal["ppo", "ppo_lagrangian", "cpo"]
+AlgorithmName = Literal["ppo", "ppo_lagrangian", "cpo"]
 # PPO is a PPO-Lagrangian slot that ignores cost.
 GROUPS: tuple[Algorithm, ...] = ("ppo_lagrangian", "cpo")
 
@@ -62,12 +62,12 @@ class Method:
       label: its name in files and tables.
       algorithm: ppo, ppo_lagrangian or cpo.
       cost: the training cost, see `costs.training_cost`.
-      limit: allowed training cost of an episode.
+      limit: allowed training cost per episode.
       theta: the intrinsic network's parameters, if `cost` uses it.
     """
 
     label: str
-    algorithm: Learners = "ppo_lagrangian"
+    algorithm: AlgorithmName = "ppo_lagrangian"
     cost: str = "extrinsic"
     limit: float = 0.0
     theta: tuple[float, ...] | None = None
@@ -82,7 +82,7 @@ class Method:
 
 
 @dataclass(frozen=True)
-class TableConfig:
+class SweepConfig:
     """What is trained: every method with every seed, side by side.
 
     Attributes:
@@ -130,7 +130,7 @@ class TableConfig:
         return slots * self.train.num_epochs * epoch
 
 
-class TableState(struct.PyTreeNode):
+class SweepState(struct.PyTreeNode):
     """What a checkpoint holds.
 
     Attributes:
@@ -142,7 +142,7 @@ class TableState(struct.PyTreeNode):
     epoch: jax.Array
 
 
-def table_slots(config: TableConfig) -> tuple[Slot, ...]:
+def sweep_slots(config: SweepConfig) -> tuple[Slot, ...]:
     """The stacked slots of each group; the key of a slot is that of its seed."""
     thetas = [row.theta for row in config.methods if row.theta is not None]
     unused = np.zeros_like(thetas[0]) if thetas else None
@@ -161,8 +161,8 @@ def table_slots(config: TableConfig) -> tuple[Slot, ...]:
     )
 
 
-def run_table(
-    config: TableConfig,
+def run_sweep(
+    config: SweepConfig,
     path: Path,
     *,
     resume: bool = False,
@@ -190,7 +190,7 @@ def run_table(
       DiskFullError: the disk is full; the directory is intact.
     """
     require_episodes(num_episodes)
-    slots = table_slots(config)
+    slots = sweep_slots(config)
     largest = max(group.key.shape[0] for group in slots)
     devices = useful_devices(devices, largest, "slots of an algorithm")
     env = make_env(config.train.env)
@@ -204,7 +204,7 @@ def run_table(
             f"{env.config.name}: {len(config.methods)} methods x {len(config.seeds)} "
             f"seeds, {config.env_steps:,} env steps on {len(devices)} device(s)"
         )
-        state = TableState(population.init(slots), jnp.zeros((), jnp.int32))
+        state = SweepState(population.init(slots), jnp.zeros((), jnp.int32))
         state, resumed = start(run, path, state, display, resume)
         if resumed:
             display.say(f"resuming {path} after {int(state.epoch)} epochs")
@@ -218,10 +218,10 @@ def run_table(
 
 
 def _chunks(
-    config: TableConfig,
+    config: SweepConfig,
     population: Population,
     slots: tuple[Slot, ...],
-    state: TableState,
+    state: SweepState,
     display: Display,
 ) -> Iterator[Chunk]:
     """Train chunk after chunk, and show each."""
@@ -241,7 +241,7 @@ def _chunks(
         )
         rows = metric_rows(config.algorithms, metrics)
         yield Chunk(
-            state=TableState(learners, jnp.asarray(after, jnp.int32)),
+            state=SweepState(learners, jnp.asarray(after, jnp.int32)),
             first=epoch,
             rows=[row | {"epoch": epoch + k} for k, row in enumerate(rows)],
             position={},
@@ -249,7 +249,7 @@ def _chunks(
         )
 
 
-def _line(config: TableConfig, name: str, metrics: dict[str, np.ndarray]) -> str:
+def _line(config: SweepConfig, name: str, metrics: dict[str, np.ndarray]) -> str:
     """Return / cost of each method, means over its seeds."""
     cells: dict[str, list[int]] = {}
     for index, (method, _) in enumerate(config.group(name)):
@@ -263,8 +263,8 @@ def _line(config: TableConfig, name: str, metrics: dict[str, np.ndarray]) -> str
 
 def _finish(
     run: RunDir,
-    config: TableConfig,
-    state: TableState,
+    config: SweepConfig,
+    state: SweepState,
     display: Display,
     num_episodes: int,
 ) -> list[dict[str, Any]]:

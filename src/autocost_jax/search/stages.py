@@ -188,8 +188,8 @@ def stage_result(
     """Fitness and scores of a finished stage; a frozen agent costs +inf.
 
     A candidate's scores are the means over its seeds. Its return is the mean over the
-    algorithms; so is its cost, or with `judge_by="success"` the share of violating
-    episodes, to which is added how far it is from success, see `shortfall`.
+    algorithms; so is its cost, but with `judge_by="success"`, where it is how far the
+    candidate is from success, see `shortfall`.
 
     Args:
       config: the search.
@@ -224,8 +224,7 @@ def stage_result(
     else:
         names = ("violating_worlds", "ep_return")
         plain = (references[name][:, 0] for name in names)
-        cost = jnp.mean(scores["violating_worlds"], axis=0)
-        cost += shortfall(*(scores[name] for name in names), *plain)
+        cost = shortfall(*(scores[name] for name in names), *plain)
     fitness = Fitness(
         cost=jnp.where(broken, jnp.inf, cost),
         ep_return=jnp.where(broken, -jnp.inf, jnp.mean(scores["ep_return"], axis=0)),

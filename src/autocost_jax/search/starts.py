@@ -10,7 +10,7 @@ from autocost_jax.records import Key
 QUIET_COST = 0.01  # where a cost begins to speak
 QUIET_PLACES = (30.0, 70.0)  # percentiles of typical places at which it may begin
 LOUD_PLACE = 85.0  # percentile at which its loudness is set
-LOUD_COSTS = (0.02, 0.9)  # how loud it may be there
+LOUD_COSTS = (0.05, 0.9)  # how loud it may be there
 UNEVEN = 0.25  # relative deviation of a unit's weights: how much directions differ
 
 
@@ -19,9 +19,10 @@ def graded_start(
     num: int,
     std: float,
     lidars: jax.Array,
-    network: CostNetwork = "dense",
+    network: CostNetwork = "lidar_mlp",
     quiet_places: tuple[float, float] = QUIET_PLACES,
     loud_costs: tuple[float, float] = LOUD_COSTS,
+    quiet_cost: float = QUIET_COST,
 ) -> jax.Array:
     """Random costs that rise as anything comes nearer; ours, not the paper's start.
 
@@ -41,6 +42,7 @@ def graded_start(
       network: which network the parameters are of.
       quiet_places: percentiles, within [0, 85).
       loud_costs: lowest and highest, in (0, 1).
+      quiet_cost: where a cost begins to speak, in (0, 1).
 
     Returns:
       theta [P, D].
@@ -59,8 +61,8 @@ def graded_start(
     low_level, high_level = (jnp.log(cost) for cost in loud_costs)
     level = jax.random.uniform(key_level, (num,), minval=low_level, maxval=high_level)
     contrast = jnp.maximum(high - low, 0.01 * outer.sum(1))  # units may be all but off
-    scale = (_logit(jnp.exp(level)) - _logit(QUIET_COST)) / contrast
-    last = _logit(QUIET_COST) - scale * low
+    scale = (_logit(jnp.exp(level)) - _logit(quiet_cost)) / contrast
+    last = _logit(quiet_cost) - scale * low
     return _join_parts(inner, bias, scale[:, None] * outer, last)
 
 
@@ -85,7 +87,7 @@ def _join_parts(
 
 def _readings(lidars: jax.Array, network: CostNetwork) -> jax.Array:
     """What the rows of W1 are multiplied with, [M, rows]."""
-    return lidars if network == "dense" else lidars.max(1, keepdims=True)
+    return lidars if network == "lidar_mlp" else lidars.max(1, keepdims=True)
 
 
 def _logits(theta: jax.Array, lidars: jax.Array) -> jax.Array:

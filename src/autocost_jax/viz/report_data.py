@@ -20,9 +20,9 @@ class StageRecord:
 
     Attributes:
       theta: [P, D] the candidates' networks.
-      cost: [P] extrinsic cost of an episode, mean over the agents; +inf: frozen.
+      cost: [P] extrinsic cost per episode, mean over the agents; +inf: frozen.
       judged: [P] what the candidates are ranked by, see `SearchConfig.judge_by`.
-      ep_return: [P] return of an episode, likewise; -inf: frozen.
+      ep_return: [P] return per episode, likewise; -inf: frozen.
       algorithm_cost: [A, P] the same cost of each algorithm's agent.
       algorithm_return: [A, P] the same return of each algorithm's agent.
       zero_violation: [P] bool, whether no fitness episode had any extrinsic cost.
@@ -85,8 +85,8 @@ class Curve:
         still running.
       algorithm: one of `ReportData.algorithms`.
       epoch: [E] epoch numbers within the stage.
-      ep_return: [E, P] return of an episode, by candidate.
-      ep_cost: [E, P] extrinsic cost of an episode.
+      ep_return: [E, P] return per episode, by candidate.
+      ep_cost: [E, P] extrinsic cost per episode.
       ep_total_cost: [E, P] extrinsic + intrinsic, what the learner sees.
     """
 
@@ -124,8 +124,8 @@ class SummaryRow:
     Attributes:
       algorithm: one of `ReportData.algorithms`.
       cost: a key of `COST_LABELS`: extrinsic, safety_margin_3x or best.
-      ep_return: mean return of an episode; NaN here and below: unknown.
-      ep_cost: mean extrinsic cost of an episode.
+      ep_return: mean return per episode; NaN here and below: unknown.
+      ep_cost: mean extrinsic cost per episode.
       violation_rate: share of the episodes with any extrinsic cost.
       outside_share: share of the steps outside the arena.
       seeds: how many agents were trained afresh; 0: unknown.
@@ -150,8 +150,8 @@ class ReferenceScore:
       stage: index into `ReportData.stages`, from 0.
       algorithm: one of `ReportData.algorithms`.
       cost: extrinsic or safety_margin_3x.
-      ep_return: its return of an episode; NaN here and below: unknown.
-      ep_cost: its extrinsic cost of an episode.
+      ep_return: its return per episode; NaN here and below: unknown.
+      ep_cost: its extrinsic cost per episode.
       violation_rate: share of its episodes with any extrinsic cost.
       outside_share: share of its steps outside the arena.
     """
