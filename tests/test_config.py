@@ -215,7 +215,7 @@ def sizes(config: SearchConfig) -> dict[str, object]:
 # The table of sizes: what each preset promises.
 PROMISED = {
     "laptop": {
-        "candidates": 19,
+        "candidates": 16,
         "elites": 3,
         "stages": 2,
         "init_std": 8.0,
@@ -253,7 +253,7 @@ PROMISED = {
         "nets": (16, 16),
     },
 }
-EPOCHS = {"laptop": 38, "search": 64, "paper": 333, "smoke": 2}
+EPOCHS = {"laptop": 36, "search": 64, "paper": 333, "smoke": 2}
 FITNESS_EPOCHS = {"laptop": 12, "search": 16, "paper": 10, "smoke": 1}
 
 

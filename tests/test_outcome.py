@@ -77,8 +77,8 @@ def test_finalists_are_judged_by_the_last_epochs_of_their_training():
     )
     np.testing.assert_array_equal(ep_return[1, :3], [[0, 1], [2, 3], [4, 5]])
     np.testing.assert_array_equal(violations[0, 3], [-6, -7])
-    rows = finalist_rows(config, np.array([19, 2, 37]), ep_return, violations)
-    assert [(row["stage"], row["index"]) for row in rows] == [(1, 0), (0, 2), (1, 18)]
+    rows = finalist_rows(config, np.array([16, 2, 31]), ep_return, violations)
+    assert [(row["stage"], row["index"]) for row in rows] == [(1, 0), (0, 2), (1, 15)]
     assert rows[1]["cpo"]["return"] == [2, 3]
 
 
