@@ -1,13 +1,13 @@
 """Which random costs are useful, and what a short training tells of them.
 
-    python experiments/starts.py run      # two grids of costs, each one table of slots
+    python experiments/starts.py run      # grids of costs, each one table of slots
     python experiments/starts.py collect  # JSON and table
 
-A cost of `graded_start` is drawn by three numbers: how loud it is where it begins to
-speak (`quiet_cost`), how far it reaches (the percentile of typical places at which it
-begins), and how loud it is at the 85th percentile. Here they are set, not drawn. Each
-cost trains both algorithms with three seeds of the `laptop` preset's learner, beside
-the extrinsic cost alone and a margin of 3x.
+A cost of `graded_start` is drawn by how loud it is where it begins to speak
+(`quiet_cost`), how far it reaches (the percentile of typical places at which it
+begins), how loud it is at the 85th percentile, and how steep its hidden units are. Here
+all four are set, not drawn. Each cost trains both algorithms with three seeds of the
+`laptop` preset's learner, beside the extrinsic cost alone and a margin of 3x.
 
 The second table asks what makes a stage's ranking mean something: the rank correlation
 (Spearman) of one seed's score after 40 or 48 epochs with the truth, which is how far
@@ -36,20 +36,28 @@ LEARNER = "32-32, multiplier from 0.5 at 0.01"  # of experiments/learners.py
 EPOCHS, FITNESS, SEEDS = 80, 12, (0, 1, 2)
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 METRICS = ("ep_return", "violating_worlds", "ep_cost")
-# name -> (quiet_cost, percentile at which it begins, cost at the 85th percentile)
-GRIDS: dict[str, list[tuple[float, float, float]]] = {
+# name -> (quiet_cost, percentile at which it begins, cost at the 85th percentile, scale
+# of the hidden weights); a place in the list modulo KEYS gives a cost's random key
+GRIDS: dict[str, list[tuple[float, float, float, float]]] = {
     "convex": [
-        (1e-4, reach, loud)
+        (1e-4, reach, loud, 8.0)
         for reach in (5.0, 20.0, 35.0, 50.0, 65.0, 78.0)
         for loud in (0.02, 0.1, 0.4, 0.95)
     ],
     "straight": [
-        (quiet, reach, loud)
+        (quiet, reach, loud, 8.0)
         for reach in (40.0, 60.0)
         for loud in (0.15, 0.3, 0.6)
         for quiet in (1e-3, 1e-2)
     ],
+    "steep": [
+        (1e-2, reach, loud, scale)
+        for scale in (8.0, 16.0, 32.0)
+        for reach in (50.0, 62.0)
+        for loud in (0.3, 0.5)
+    ],
 }
+KEYS = {"convex": 24, "straight": 12, "steep": 4}
 STAGES = (40, 48)  # lengths of a stage that are compared
 
 
@@ -67,14 +75,14 @@ def table_of(name: str, smoke: bool = False) -> SweepConfig:
         ("extrinsic", "extrinsic", None),
         ("margin 3x", "extrinsic+safety_margin_3x", None),
     ]
-    for i, (quiet, reach, loud) in enumerate(grid):
-        key = jax.random.key(1000 + i)
+    for i, (quiet, reach, loud, scale) in enumerate(grid):
+        key = jax.random.key(1000 + i % KEYS[name])
         theta = graded_start(
-            key, 1, 8.0, lidars,
+            key, 1, scale, lidars,
             quiet_places=(reach, reach), loud_costs=(loud, loud), quiet_cost=quiet,
         )[0]  # fmt: skip
-        label = f"{quiet:g} at {reach:g}, {loud:g} at 85"
-        rows.append((label, "extrinsic+intrinsic", tuple(map(float, theta))))
+        values = tuple(map(float, theta))
+        rows.append((label_of(*grid[i]), "extrinsic+intrinsic", values))
     methods = tuple(
         Method(f"{algorithm} {label}", algorithm, cost, 0.0, theta)
         for algorithm in ALGORITHMS
@@ -83,8 +91,13 @@ def table_of(name: str, smoke: bool = False) -> SweepConfig:
     return SweepConfig(train=train, methods=methods, seeds=SEEDS[: 2 if smoke else 3])
 
 
+def label_of(quiet: float, reach: float, loud: float, scale: float) -> str:
+    """What a cost is called in the table."""
+    return f"{quiet:g} at {reach:g}, {loud:g} at 85, scale {scale:g}"
+
+
 def run(options: Options) -> None:
-    """Both grids."""
+    """All grids."""
     for name in options.only or GRIDS:
         table = table_of(name, options.smoke)
         run_if_needed(table, options.runs / name, num_episodes=100)
@@ -108,7 +121,7 @@ def last(values: np.ndarray, after: int, fitness: int = FITNESS) -> np.ndarray:
 def distance(
     values: dict[str, np.ndarray], after: int, seeds: list[int], logs: bool = False
 ) -> np.ndarray:
-    """[C - 2] how far the costs are from success, plus their violations.
+    """[C - 2] how far the costs are from success.
 
     With `logs` distances are counted in factors, else in shares as in `shortfall`.
     """
@@ -116,12 +129,11 @@ def distance(
     rate = last(values["violating_worlds"], after)[..., seeds].mean(-1)
     costs = (rate[:, 2:], ep_return[:, 2:])
     if not logs:
-        far = np.asarray(shortfall(*costs, rate[:, 0], ep_return[:, 0]))
-        return far + costs[0].mean(0)
+        return np.asarray(shortfall(*costs, rate[:, 0], ep_return[:, 0]))
     left = np.maximum(costs[0], 0.01) / rate[:, :1]
     kept = np.maximum(costs[1] / ep_return[:, :1], 0.003)
     far = np.maximum(np.log(left / 0.25), 0) + np.maximum(np.log(0.3 / kept), 0)
-    return far.sum(0) + costs[0].mean(0)
+    return far.sum(0)
 
 
 def rank_correlations(values: dict[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -160,7 +172,7 @@ def summarise(name: str, values: dict[str, np.ndarray]) -> dict[str, Any]:
     end = len(values["ep_cost"])
     tables = {metric: last(values[metric], end) for metric in METRICS}
     labels = ["extrinsic", "margin 3x"]
-    labels += [f"{q:g} at {r:g}, {x:g} at 85" for q, r, x in GRIDS[name]]
+    labels += [label_of(*cost) for cost in GRIDS[name]]
     rows = [
         {
             "cost": label,
@@ -220,7 +232,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def collect(options: Options) -> None:
-    """JSON and table of both grids."""
+    """JSON and table of all grids."""
     num_seeds = 2 if options.smoke else len(SEEDS)
     grids = [
         summarise(name, histories(options.runs / name, num_seeds))

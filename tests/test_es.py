@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from autocost_jax import make_env, preset
+from autocost_jax import EnvConfig, make_env, preset
 from autocost_jax.config import SearchConfig
 from autocost_jax.costs import HIDDEN, intrinsic_cost
 from autocost_jax.es import (
@@ -54,7 +54,7 @@ def selected(fitness, num_elites=2, **options):
 @pytest.fixture(scope="module")
 def places():
     """Readings [256, 8] at typical places."""
-    env = make_env("Goal-Hazard-Point")
+    env = make_env(EnvConfig(physics="closed_form"))
     return jax.jit(lambda key: typical_lidars(env, key, 256))(jax.random.key(1))
 
 

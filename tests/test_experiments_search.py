@@ -21,6 +21,7 @@ RESULTS = Path(__file__).parents[1] / "experiments" / "results"
         ("main_job", "laptop", None),
         ("fitness", "fitness", "rules"),
         ("learners", "learners", "settings"),
+        ("starts", "starts", None),
     ],
 )
 def test_tables_are_those_of_the_committed_json(script, folder, rows):
@@ -59,6 +60,37 @@ def test_the_shipped_cost_is_one_of_the_study():
     assert not theta[:2].any()
     np.testing.assert_allclose(theta[36], load_cost("lidar_mlp"), rtol=1e-4, atol=1e-4)
     np.testing.assert_array_equal(fitness.costs(fitness.SMOKE)[[2, 4]], theta[[2, 42]])
+
+
+def test_costs_of_the_study_of_starts_are_those_of_the_script():
+    starts = load_script("experiments/starts")
+    result = json.loads((RESULTS / "starts" / "starts.json").read_text())
+    for grid in result["grids"]:
+        methods = starts.table_of(grid["grid"]).methods
+        labels = {method.label.partition(" ")[2] for method in methods}
+        assert {row["cost"] for row in grid["rows"]} == labels
+
+
+def test_a_stage_that_tells_the_truth_ranks_perfectly():
+    """Costs from useless to unsafe, the same in every epoch and for every seed."""
+    starts = load_script("experiments/starts")
+    kept = np.array([1.0, 0.4, 0.0, 0.1, 0.2, 0.4, 0.9])
+    left = np.array([1.0, 0.2, 0.1, 0.1, 0.1, 0.1, 0.8])
+    shape = (60, 2, 7, 3)
+    values = {
+        "ep_return": np.broadcast_to(20 * kept[:, None], shape),
+        "violating_worlds": np.broadcast_to(0.8 * left[:, None], shape),
+        "ep_cost": np.broadcast_to(3.0 * left[:, None], shape),
+    }
+    ranks = {
+        (row["rule"], row["epochs"]): row["by_seed"]
+        for row in starts.rank_correlations(values)
+    }
+    assert ranks["success, in shares", 40] == pytest.approx([1.0] * 3)
+    assert max(ranks["extrinsic cost", 40]) < 0.9  # it likes useless costs
+    far = starts.distance(values, 60, [0])
+    assert far[3] == 0.0
+    assert far[0] == pytest.approx(2.0)  # useless with both algorithms
 
 
 def test_the_interval_of_a_fall():

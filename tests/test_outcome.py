@@ -72,9 +72,8 @@ def test_finalists_are_judged_by_the_last_epochs_of_their_training():
     values = np.zeros((after + 5, 2, slots))  # rows behind the end are another stage's
     values[after - config.fitness_epochs : after] = np.arange(slots)
     values[after:] = 99.0
-    ep_return, violations = last_scores(
-        config, {"ep_return": values, "violating_worlds": -values}
-    )
+    history: Any = {"ep_return": values, "violating_worlds": -values}
+    ep_return, violations = last_scores(config, history)
     np.testing.assert_array_equal(ep_return[1, :3], [[0, 1], [2, 3], [4, 5]])
     np.testing.assert_array_equal(violations[0, 3], [-6, -7])
     rows = finalist_rows(config, np.array([16, 2, 31]), ep_return, violations)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from autocost_jax.agents.trust_region import linearise
 from autocost_jax.config import AgentConfig
 from autocost_jax.records import CostInputs, Slot, TrainingCost, Trajectory
 
@@ -55,3 +56,19 @@ def act(agent, state, key, sizes=SIZES, num_worlds=8):
     shape = (sizes.episode_length + 1, num_worlds, sizes.observation_size)
     obs = jax.random.uniform(key_obs, shape)
     return obs, agent.policy(state, obs[:-1], key_act)
+
+
+def fisher_product(distribution, theta, weight, damping):
+    """(F + damping I) z of any policy, by derivatives: an oracle for the factored one.
+
+    F z = J^T [w_r / std^2 * (J_mu z), 2 * (J_log_std z)],  sum_r w_r = 1
+    """
+    lin = linearise(distribution, theta)
+    share = weight / jnp.maximum(jnp.sum(weight), 1.0)
+    scale = share[:, None] * jnp.exp(-2.0 * lin.log_std)[None, :]
+
+    def product(direction):
+        mean, log_std = lin.jvp(direction)
+        return lin.vjp((scale * mean, 2.0 * log_std)) + damping * direction
+
+    return jax.vmap(product)

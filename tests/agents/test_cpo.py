@@ -4,10 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from agent_toys import fisher_product
 
 from autocost_jax.agents.advantages import centre, normalise
 from autocost_jax.agents.base import Batch
-from autocost_jax.agents.cpo import cpo_step, surrogates, update_policy
+from autocost_jax.agents.cpo import cpo_step, surrogates
+from autocost_jax.agents.cpo import update_policy as update_with
 from autocost_jax.agents.networks import log_prob
 from autocost_jax.agents.trust_region import conjugate_gradient
 from autocost_jax.config import AgentConfig
@@ -285,6 +287,11 @@ def bandit(num_dead=0):
         return jnp.broadcast_to(theta, (rows, 2)), jnp.zeros(2, theta.dtype)
 
     return batch, distribution
+
+
+def update_policy(config, distribution, theta, batch, c):
+    product = fisher_product(distribution, theta, batch.weight, config.cg_damping)
+    return update_with(config, distribution, theta, batch, c, product)
 
 
 GOLDEN = [

@@ -38,7 +38,6 @@ from autocost_jax.agents.trust_region import (
     Product,
     backtrack,
     conjugate_gradient,
-    fisher_product,
     linearise,
 )
 from autocost_jax.config import AgentConfig
@@ -140,7 +139,7 @@ def update_policy(
     theta: jax.Array,
     batch: Batch,
     c: jax.Array,
-    product: Product | None = None,
+    product: Product,
 ) -> tuple[jax.Array, Metrics]:
     """One trust-region step with backtracking, on the full batch.
 
@@ -154,16 +153,13 @@ def update_policy(
       theta: [n] flat policy parameters.
       batch: the epoch's rows.
       c: [] cost per step above the limit.
-      product: multiplication by the damped Fisher matrix, [2, n] -> [2, n]; None
-        forms it from `distribution`.
+      product: multiplication by the damped Fisher matrix, [2, n] -> [2, n].
 
     Returns:
       Parameters [n], theta itself if no candidate is accepted, and the metrics of
       `cpo`.
     """
     lin = linearise(distribution, theta)
-    if product is None:
-        product = fisher_product(lin, batch.weight, config.cg_damping)
     at = (lin.mean, lin.log_std)
     old_loss, old_cost = surrogates(at, batch)
     gradients = jax.jacrev(lambda at: jnp.stack(surrogates(at, batch)))(at)

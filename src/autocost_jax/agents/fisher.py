@@ -51,7 +51,7 @@ def mlp_fisher_product(
 
     Returns:
       A function of a few directions [K, n] -> [K, n], in the order of
-      `ravel_pytree(params)`; equal to `trust_region.fisher_product` to rounding.
+      `ravel_pytree(params)`.
     """
     names = [f"Dense_{index}" for index in range(len(params["mean"]))]
     _, unravel = ravel_pytree(params)

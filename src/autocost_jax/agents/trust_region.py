@@ -1,4 +1,4 @@
-"""Second-order pieces: Fisher products, conjugate gradient, backtracking.
+"""Second-order pieces: a linearised policy, conjugate gradient, backtracking.
 
 Everything stays finite for every lane of a `vmap`.
 """
@@ -43,29 +43,6 @@ def linearise(distribution: Distribution, theta: jax.Array) -> Linearised:
     (mean, log_std), jvp = jax.linearize(distribution, theta)
     transpose = jax.linear_transpose(jvp, theta)
     return Linearised(mean, log_std, jvp, lambda cotangent: transpose(cotangent)[0])
-
-
-def fisher_product(lin: Linearised, weight: jax.Array, damping: float) -> Product:
-    """Products (F + damping I) z, with F the Hessian of the mean KL at the parameters.
-
-        F z = J^T [w_r / std^2 * (J_mu z), 2 * (J_log_std z)],  sum_r w_r = 1
-
-    Args:
-      lin: the linearised policy.
-      weight: [R] 0.0 or 1.0, normalised here.
-      damping: added to every eigenvalue.
-
-    Returns:
-      A function of a stack of directions [K, n] -> [K, n].
-    """
-    share = weight / jnp.maximum(jnp.sum(weight), 1.0)
-    scale = share[:, None] * jnp.exp(-2.0 * lin.log_std)[None, :]
-
-    def product(direction: jax.Array) -> jax.Array:
-        mean, log_std = lin.jvp(direction)
-        return lin.vjp((scale * mean, 2.0 * log_std)) + damping * direction
-
-    return jax.vmap(product)
 
 
 def dot(x: jax.Array, y: jax.Array) -> jax.Array:
