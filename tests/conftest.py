@@ -62,7 +62,7 @@ def compilation_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     path = os.environ.get("JAX_COMPILATION_CACHE_DIR") or run / "jax_cache"
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(path)  # for command lines under test
     jax.config.update("jax_compilation_cache_dir", str(path))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 @pytest.fixture
