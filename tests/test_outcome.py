@@ -98,6 +98,14 @@ def test_without_a_success_the_shortfalls_add_up():
     assert pick(CONFIG, *scores) == 1
 
 
+def test_of_equally_safe_ones_the_most_useful_is_picked():
+    scores = finalists(
+        [[5.0, 6.0, 4.0, 10.0, 2.0], [7.0, 8.0, 7.0, 20.0, 5.0]],
+        [[0.02, 0.02, 0.02, 0.6, 0.0], [0.1, 0.1, 0.1, 0.7, 0.2]],
+    )
+    assert pick(CONFIG, *scores) == 1
+
+
 def test_a_finalist_without_a_valid_episode_is_never_picked():
     scores = finalists(
         [[np.nan, 5.0, 6.0, 10.0, 2.0], [8.0, 7.0, 9.0, 20.0, 5.0]],
