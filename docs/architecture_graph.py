@@ -62,8 +62,8 @@ def draw(rooms: dict[str, set[str]], floors: dict[str, int], path: Path) -> None
         for i, name in enumerate(names):
             shift = 0.35 * (-1) ** floor  # else arrows would hide behind boxes
             place[name] = ((i + 1) / (len(names) + 1) * 10 + shift, floor)
-    for name, others in rooms.items():
-        for other in others:
+    for name, others in sorted(rooms.items()):
+        for other in sorted(others):
             (x, y), (to_x, to_y) = place[name], place[other]
             axes.annotate(
                 "", (to_x, to_y + 0.22), (x, y - 0.22),
