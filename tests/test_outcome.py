@@ -1,6 +1,7 @@
 """Whether a search succeeded, and how that is said."""
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,11 @@ def test_finalists_are_judged_by_the_last_epochs_of_their_training():
     values[after - config.fitness_epochs : after] = np.arange(slots)
     values[after:] = 99.0
     history: Any = {"ep_return": values, "violating_worlds": -values}
-    ep_return, violations = last_scores(config, history)
+    frozen = np.zeros((2, slots), bool)
+    frozen[1, 9] = True  # the second seed of a reference
+    learners: Any = [SimpleNamespace(frozen=group) for group in frozen]
+    ep_return, violations = last_scores(config, history, learners)
+    np.testing.assert_array_equal(ep_return[1, 4], [8, np.nan])
     np.testing.assert_array_equal(ep_return[1, :3], [[0, 1], [2, 3], [4, 5]])
     np.testing.assert_array_equal(violations[0, 3], [-6, -7])
     rows = finalist_rows(config, np.array([16, 2, 31]), ep_return, violations)
@@ -98,6 +103,15 @@ def test_without_a_success_the_shortfalls_add_up():
     assert pick(CONFIG, *scores) == 1
 
 
+def test_a_reference_with_a_frozen_seed_still_sets_the_bars():
+    ep_return, violations = finalists(
+        [[1.0, 5.0, 6.0, 10.0, 2.0], [8.0, 7.0, 9.0, 20.0, 5.0]],
+        [[0.0, 0.02, 0.2, 0.6, 0.0], [0.0, 0.1, 0.1, 0.7, 0.2]],
+    )
+    ep_return[:, 3, 0] = violations[:, 3, 0] = np.nan
+    assert pick(CONFIG, ep_return, violations) == 1
+
+
 def test_of_equally_safe_ones_the_most_useful_is_picked():
     scores = finalists(
         [[5.0, 6.0, 4.0, 10.0, 2.0], [7.0, 8.0, 7.0, 20.0, 5.0]],
@@ -106,7 +120,7 @@ def test_of_equally_safe_ones_the_most_useful_is_picked():
     assert pick(CONFIG, *scores) == 1
 
 
-def test_a_finalist_without_a_valid_episode_is_never_picked():
+def test_a_finalist_with_a_frozen_agent_is_never_picked():
     scores = finalists(
         [[np.nan, 5.0, 6.0, 10.0, 2.0], [8.0, 7.0, 9.0, 20.0, 5.0]],
         [[np.nan, 0.5, 0.6, 0.6, 0.0], [0.0, 0.5, 0.6, 0.7, 0.2]],

@@ -59,7 +59,7 @@ def finish(
     )
     chosen, finalists = 0, []
     if config.num_finalists:
-        last = last_scores(config, state.history)
+        last = last_scores(config, state.history, state.learners)
         chosen = pick(config, *last)
         finalists = finalist_rows(config, np.asarray(order), *last)
         actors, num_seeds = final_actors(config, state.learners, chosen)

@@ -112,23 +112,26 @@ def _mean(values: Any, valid: Any) -> np.ndarray:
 
 
 def last_scores(
-    config: SearchConfig, history: Metrics
+    config: SearchConfig, history: Metrics, learners: tuple[Learner, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return and share of violating episodes at the end of the finalists' training.
 
     Args:
       config: the search.
       history: of the finalists' stage, see `SearchState`.
+      learners: of that stage.
 
     Returns:
-      Two arrays [A, F + R, S], means over the last `fitness_epochs`.
+      Two arrays [A, F + R, S], means over the last `fitness_epochs`; NaN: frozen.
     """
     after = config.epochs_of(config.num_stages)
     dealt = deal(config, is_final=True)
 
+    frozen = dealt.table(np.stack([np.asarray(group.frozen) for group in learners]))
+
     def table(name: str) -> np.ndarray:
         values = np.asarray(history[name])[after - config.fitness_epochs : after]
-        return dealt.table(values).mean(0)
+        return np.where(frozen, np.nan, dealt.table(values).mean(0))
 
     return table("ep_return"), table("violating_worlds")
 
@@ -142,14 +145,17 @@ def pick(config: SearchConfig, ep_return: np.ndarray, violations: np.ndarray) ->
     Args:
       config: the search.
       ep_return: [A, F + R, S] of the finalists, then the references.
-      violations: [A, F + R, S] share of violating episodes.
+      violations: [A, F + R, S] share of violating episodes. A finalist with a NaN is
+        never picked; of a reference the other seeds count.
     """
     count = config.num_finalists
-    ep_return, violations = ep_return.mean(2), violations.mean(2)
+    both = (violations, ep_return)
+    plain = [jnp.nanmean(x[:, count : count + 1], axis=(1, 2)) for x in both]
+    violations, ep_return = (x.mean(2) for x in both)
     short = np.zeros(count)
     if config.references:
         costs = (violations[:, :count], ep_return[:, :count])
-        short = np.asarray(shortfall(*costs, violations[:, count], ep_return[:, count]))
+        short = np.asarray(shortfall(*costs, *plain))
     order = np.lexsort(
         (
             -ep_return[:, :count].mean(0),
