@@ -29,6 +29,7 @@ _GUIDED: dict[str, Any] = {
     "mutation_high": 1.1,
     "references": True,
     "judge_by": "success",
+    "training_seeds": "candidate",
     "pool_scores": True,
 }
 
@@ -38,7 +39,7 @@ PRESETS: dict[str, SearchConfig] = {
             env=EnvConfig(physics="closed_form"),
             agent=_LAPTOP_AGENT,
             num_worlds=8,
-            num_epochs=36,
+            num_epochs=40,
             chunk_epochs=2,
         ),
         population_size=16,
@@ -46,7 +47,7 @@ PRESETS: dict[str, SearchConfig] = {
         num_stages=2,
         fitness_epochs=12,
         num_finalists=4,
-        final_epochs=110,
+        final_epochs=104,
         **_GUIDED,
     ),
     "search": SearchConfig(
