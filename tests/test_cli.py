@@ -59,7 +59,7 @@ def asked(monkeypatch):
 
 def test_train_resumes_with_another_population_chunk(trained, asked):
     """And without the other flags, which default to the run's own settings."""
-    main(["train", "--out", str(trained), "--resume", "--population-chunk", "2"])
+    main(["train", "--out", str(trained), "--resume", "--set", "population_chunk=2"])
     (table,) = asked
     assert table.train.population_chunk == 2
     with RunDir.open(trained, table) as run:

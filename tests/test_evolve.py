@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,8 +17,9 @@ import pytest
 import yaml
 
 import autocost_jax
+from autocost_jax.cli import main as cli
 from autocost_jax.commandline import use_compile_cache
-from autocost_jax.config import preset
+from autocost_jax.config import SearchConfig, preset
 from autocost_jax.evolve import evolve
 from autocost_jax.evolve.__main__ import main
 from autocost_jax.runs.config_files import first_difference
@@ -233,6 +235,11 @@ def bad(capsys, *argv: str) -> str:
         (["--num-epochs", "0"], ["num_epochs"]),
         (["--selection", "best"], ["--selection", "paper", "random"]),
         (["--devices", "99"], ["devices", "99"]),
+        (["--set", "mutations=0.5"], ["'mutations'", "mutation_std", "info --preset"]),
+        (["--set", "population_size=many"], ["population_size", "'many'"]),
+        (["--set", "hidden_sizes=[8, 0]"], ["hidden_sizes"]),
+        (["--set", "num_worlds"], ["name=value", "'num_worlds'"]),
+        (["--set", "hidden_sizes=[8"], ["hidden_sizes=[8", "YAML"]),
     ],
 )
 def test_bad_flags_get_one_line_and_status_2(capsys, tmp_path, flags, words):
@@ -266,7 +273,7 @@ def asked(monkeypatch):
 def test_resume_uses_another_population_chunk(asked, tmp_path):
     recorded = dataclasses.replace(preset("smoke"), seed=3)
     RunDir.create(tmp_path, recorded, {}).close()
-    main(["--out", str(tmp_path), "--resume", "--population-chunk", "3"])
+    main(["--out", str(tmp_path), "--resume", "--set", "population_chunk=3"])
     ((config, _, resume),) = asked
     assert resume
     assert config.train.population_chunk == 3
@@ -301,7 +308,7 @@ def test_another_world_keeps_the_closed_form_where_it_has_one(asked):
     """And the default directory is called by the world."""
     for name in ("Goal-Hazard8-Point", "Goal-Hazard-Car", "PointGoal1"):
         main(["--env", name])
-    main(["--env", "Goal-Hazard-Point", "--hazards-num", "6", "--seed", "2"])
+    main(["--env", "Goal-Hazard-Point", "--set", "hazards_num=6", "--seed=2"])
     worlds = [(config.train.env.name, config.train.env.physics) for config, *_ in asked]
     assert worlds == [
         ("Goal-Hazard8-Point", "closed_form"),
@@ -358,8 +365,9 @@ def test_help_lists_the_flags(capsys):
         main(["--help"])
     assert stop.value.code in (0, None)
     text = capsys.readouterr().out
-    for flag in ("--preset", "--env", "--out", "--resume", "--devices", "--dry-run"):
+    for flag in ("--preset", "--env", "--out", "--resume", "--devices", "--set"):
         assert flag in text
+    assert 20 <= len(re.findall(r"^\W*--", text, re.M)) <= 27
 
 
 def test_config_of_a_run_can_be_used_for_another(whole, tmp_path, capsys):
@@ -367,6 +375,58 @@ def test_config_of_a_run_can_be_used_for_another(whole, tmp_path, capsys):
     new = tmp_path / "new"
     main(["--config", str(out), "--num-stages", "1", "--dry-run", "--out", str(new)])
     assert "1 stages of 4 candidates" in capsys.readouterr().out
+
+
+def test_settings_of_a_file_and_of_flags_come_over_the_presets(asked, tmp_path):
+    """In any order of nesting; flags over the file, `--set` over all."""
+    file = tmp_path / "mine.yaml"
+    file.write_text(
+        "num_worlds: 4\ninit_std: 2\ntrain: {agent: {hidden_sizes: [8, 8]}, "
+        "env: {hazards_num: 3}}\nenv: {num_steps: 100}\n"
+    )
+    main(["--preset", "smoke", "--config", str(file), "--seed", "5"])
+    flags = ["--num-worlds", "3", "--set", "num-worlds=6", "--set", "mutation_std=4e-1"]
+    main(["--preset", "smoke", "--config", str(file), *flags])
+    (first, *_), (second, *_) = asked
+    train = preset("smoke").train
+    agent = dataclasses.replace(train.agent, hidden_sizes=(8, 8))
+    env = dataclasses.replace(train.env, hazards_num=3, num_steps=100)
+    train = dataclasses.replace(train, num_worlds=4, agent=agent, env=env)
+    expected = dataclasses.replace(preset("smoke"), train=train, init_std=2.0, seed=5)
+    assert first == expected
+    assert second.train.num_worlds == 6
+    assert second.mutation_std == 0.4
+    assert second.train.agent == agent
+
+
+@pytest.mark.parametrize("text", ["num_wolds: 4", "- 4", "a: [", "train: {seed: []}"])
+def test_a_bad_file_of_settings_is_refused_in_one_line(capsys, tmp_path, text):
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    assert bad(capsys, "--config", str(file))
+    assert "no.yaml" in bad(capsys, "--config", "no.yaml")
+
+
+def test_no_two_settings_have_the_same_name():
+    """So that `--set` needs no paths."""
+
+    def names(config):
+        for field in dataclasses.fields(config):
+            value = getattr(config, field.name)
+            yield field.name
+            yield from names(value) if dataclasses.is_dataclass(value) else ()
+
+    found = list(names(SearchConfig()))
+    assert len(found) == len(set(found)) > 90
+
+
+def test_the_settings_of_a_preset_are_a_file_that_gives_it_back(
+    asked, capsys, tmp_path
+):
+    cli(["info", "--preset", "search"])
+    (tmp_path / "all.yaml").write_text(capsys.readouterr().out)
+    main(["--preset", "smoke", "--config", str(tmp_path / "all.yaml")])
+    assert asked[0][0] == preset("search")
 
 
 def test_the_function_keeps_its_name():

@@ -3,20 +3,18 @@
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from autocost_jax.commandline import (
     BAD_INPUT,
-    flag,
+    config_with,
     guarded,
     parse,
     quiet,
-    switch,
     use_compile_cache,
     use_devices,
-    with_env,
 )
 from autocost_jax.showing import demo, envs, render, report, run_config
 
@@ -61,24 +59,27 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _train(argv: list[str]) -> None:
     import tyro
 
-    from autocost_jax.config import TrainConfig
-
     @dataclass(frozen=True)
     class Options:
         """Train agents with any training cost, several seeds at once.
 
         Attributes:
+          preset: whose settings the training has; default: laptop.
+          set: any of them by its name, as in `--set hidden_sizes=[64,64]`, once for
+            each; `autocost info --preset laptop` lists them.
           env: one of the worlds that `autocost info` lists.
+          physics: model of the world; closed_form, the fastest, for Points on a plane.
+          num_epochs: of training.
+          num_worlds: of a slot in an epoch.
           algorithms: ppo, ppo_lagrangian, cpo: one method each.
           cost: terms of the cost bank, such as "extrinsic+0.1*safety_margin_2x".
           limit: allowed training cost per episode.
           theta: cost.npz with the intrinsic network, if the cost uses it; or the name
             of one that `autocost info` lists.
           num_seeds: seeds 0 ... N - 1.
-          preset: whose sizes the other flags default to.
           out: run directory.
           resume: continue the run in `out` with its own methods and settings, to which
-            the other flags default; only population-chunk may be another.
+            the other flags default; only population_chunk may be another.
           overwrite: start over in a directory that already holds a run.
           devices: devices to use; default: all; a CPU counts one a core.
           coordinator: of a run in several processes, HOST:PORT of the first one, or
@@ -87,10 +88,14 @@ def _train(argv: list[str]) -> None:
           process_id: of this one, from 0; leave out with auto.
           compile_cache: keep compiled programs in the user's cache directory.
           episodes: fresh episodes a policy is scored in.
-          train: worlds, epochs and the learners' settings.
         """
 
-        env: str = "Goal-Hazard-Point"
+        preset: Literal["laptop", "search", "paper", "smoke"] | None = None
+        set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+        env: str | None = None
+        physics: Literal["reduced", "full", "closed_form"] | None = None
+        num_epochs: int | None = None
+        num_worlds: int | None = None
         algorithms: tuple[Literal["ppo", "ppo_lagrangian", "cpo"], ...] = (
             "ppo_lagrangian",
         )
@@ -98,7 +103,6 @@ def _train(argv: list[str]) -> None:
         limit: float = 0.0
         theta: Path | None = None
         num_seeds: int = 1
-        preset: Literal["laptop", "search", "paper", "smoke"] = "laptop"
         out: Path = Path("runs/train")
         resume: bool = False
         overwrite: bool = False
@@ -108,12 +112,12 @@ def _train(argv: list[str]) -> None:
         process_id: int | None = None
         compile_cache: bool = True
         episodes: int = 100
-        train: Annotated[TrainConfig, tyro.conf.OmitArgPrefixes] = field(
-            default_factory=TrainConfig
-        )
 
-    recorded, train = _train_defaults(argv, Options.out)
-    options = parse(Options, argv, "autocost train", default=Options(train=train))
+    options = parse(Options, argv, "autocost train")
+    recorded, train = _train_base(options)
+    names = ("physics", "num_epochs", "num_worlds")
+    flags = {name: getattr(options, name) for name in names}
+    train = config_with(train, options.env, flags, options.set)
     use_compile_cache(options.compile_cache)
     # Before anything of JAX runs:
     group = (options.coordinator, options.num_processes, options.process_id)
@@ -121,11 +125,11 @@ def _train(argv: list[str]) -> None:
     from autocost_jax.runs.sweep import Method, SweepConfig, run_sweep
 
     if recorded is not None:
-        config = replace(recorded, train=options.train)
+        config = replace(recorded, train=train)
     else:
         theta = _theta(options.theta)
         config = SweepConfig(
-            train=options.train,
+            train=train,
             methods=tuple(
                 Method(name, name, options.cost, options.limit, theta)
                 for name in options.algorithms
@@ -142,22 +146,22 @@ def _train(argv: list[str]) -> None:
     )
 
 
-def _train_defaults(argv: list[str], out: Path) -> tuple[Any, Any]:
+def _train_base(options: Any) -> tuple[Any, Any]:
     """The recorded table on --resume, else None; and what other flags come on top of.
 
     The latter is the `TrainConfig` of a preset, or on --resume without one the run's.
     """
     from autocost_jax.config import preset
 
-    name, recorded = flag(argv, "--preset"), None
-    if switch(argv, "--resume"):
+    recorded = None
+    if options.resume:
         from autocost_jax.runs.config_files import read_config
         from autocost_jax.runs.sweep import SweepConfig
 
-        named = flag(argv, "--out")
-        recorded, _ = read_config(out if named is None else named, SweepConfig)
-    source = preset(name or "laptop") if recorded is None or name else recorded
-    return recorded, with_env(source.train, argv)
+        recorded, _ = read_config(options.out, SweepConfig)
+    if recorded is None or options.preset is not None:
+        return recorded, preset(options.preset or "laptop").train
+    return recorded, recorded.train
 
 
 def _theta(path: Path | None) -> tuple[float, ...] | None:
@@ -277,23 +281,30 @@ def _bench(argv: list[str]) -> None:
 def _info(argv: list[str]) -> None:
     @dataclass(frozen=True)
     class Options:
-        """Versions, devices, environments and presets; or the facts of a run.
+        """Versions, devices, environments; or the facts of a run, or a preset.
 
         Attributes:
           run: a run directory.
+          preset: all settings of a preset, as YAML that `--config` reads.
         """
 
         run: Path | None = None
+        preset: Literal["laptop", "search", "paper", "smoke"] | None = None
 
     options = parse(Options, argv, "autocost info")
     import yaml
 
-    if options.run is not None:
-        from autocost_jax.runs.config_files import read_document
+    from autocost_jax.config import ENVS, PRESETS, SUITE, preset
+    from autocost_jax.runs.config_files import read_document, to_dict
 
-        print(yaml.safe_dump(read_document(options.run), sort_keys=False), end="")
+    document = None
+    if options.run is not None:
+        document = read_document(options.run)
+    elif options.preset is not None:
+        document = to_dict(preset(options.preset))
+    if document is not None:
+        print(yaml.safe_dump(document, sort_keys=False), end="")
         return
-    from autocost_jax.config import ENVS, PRESETS, SUITE
     from autocost_jax.costs import BANK, list_costs
     from autocost_jax.runs.directory import run_facts
 

@@ -7,13 +7,14 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from autocost_jax.config import TrainConfig, env_config
+from autocost_jax.config import EnvConfig, SearchConfig, TrainConfig, env_config
 
 T = TypeVar("T")
+C = TypeVar("C", SearchConfig, TrainConfig)
 BAD_INPUT = 2
 
 
@@ -24,7 +25,8 @@ def parse(kind: type[T], argv: Sequence[str], prog: str, **options: Any) -> T:
     panel = io.StringIO()
     try:
         with contextlib.redirect_stderr(panel):
-            return tyro.cli(kind, args=list(argv), prog=prog, **options)
+            none = tyro.conf.DisallowNone  # nothing given is not a value
+            return tyro.cli(kind, args=list(argv), prog=prog, config=(none,), **options)
     except SystemExit as stop:
         if stop.code not in (0, None):
             fail(f"{prog}: {_first_sentence(panel.getvalue())} (see {prog} --help)")
@@ -37,49 +39,49 @@ def _first_sentence(panel: str) -> str:
     lines = [re.sub(r"[│╭╮╰╯─]+", " ", line).strip() for line in panel.splitlines()]
     text = " ".join(line for line in lines if line)
     text = re.sub(r"^(Parsing error|Value error|Error parsing \S+:)\s+", "", text)
-    text = re.sub(r"^Error parsing (search|train):\s+", "", text)
     advice = r"\s+(?:Argument helptext|For full helptext|Arguments similar)"
     return re.split(advice, text)[0]
 
 
-def flag(argv: Sequence[str], name: str) -> str | None:
-    """The value of a flag, before the flags are parsed; the last one wins, as there."""
-    value = None
-    for index, word in enumerate(argv):
-        if word == name and index + 1 < len(argv):
-            value = argv[index + 1]
-        elif word.startswith(f"{name}="):
-            value = word.partition("=")[2]
-    return value
+def config_with(
+    config: C, env: str | None, flags: Mapping[str, Any], settings: Sequence[str]
+) -> C:
+    """The configuration that a command line asks for.
 
-
-def switch(argv: Sequence[str], name: str) -> bool:
-    """Whether a switch is on, before the flags are parsed; --no-NAME turns it off."""
-    words = {name: True, name.replace("--", "--no-", 1): False}
-    given = [words[word] for word in map(_hyphens, argv) if word in words]
-    return given[-1] if given else False
-
-
-def _hyphens(word: str) -> str:
-    return word.replace("_", "-")
-
-
-def with_env(train: TrainConfig, argv: Sequence[str]) -> TrainConfig:
-    """The training configuration in the world that `--env` names, if it is given.
-
-    Flags of single settings come on top of it; only the episode's length is the
-    preset's, and the physics where the world has them.
+    Args:
+      config: a `SearchConfig` or `TrainConfig`: a preset's or a run's.
+      env: its world, if another one. Of the former only the episode's length stays, and
+        the physics where the new world has them.
+      flags: name -> value; those that are None were not given.
+      settings: "name=value" of any field, values as in YAML. They come last.
 
     Raises:
-      ValueError: if there is no such world; the message lists those that exist.
+      ValueError: no such world or setting, or a value that is not allowed.
     """
-    name = flag(argv, "--env")
-    if name is None:
-        return train
-    env = dataclasses.replace(env_config(name), num_steps=train.env.num_steps)
+    import yaml
+
+    from autocost_jax.runs.config_files import replace_fields, to_dict
+
+    given = {name: value for name, value in flags.items() if value is not None}
+    for word in settings:
+        name, mark, text = word.partition("=")
+        if not mark:
+            raise ValueError(f"set must be name=value, got {word!r}")
+        try:
+            given[name.replace("-", "_")] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise ValueError(f"set: the value of {word!r} is not YAML") from None
+    if env is not None:
+        train = config if isinstance(config, TrainConfig) else config.train
+        given = {"env": to_dict(_world(env, train.env)), **given}
+    return replace_fields(config, given)
+
+
+def _world(name: str, former: EnvConfig) -> EnvConfig:
+    env = dataclasses.replace(env_config(name), num_steps=former.num_steps)
     if env.has_closed_form:
-        env = dataclasses.replace(env, physics=train.env.physics)
-    return dataclasses.replace(train, env=env)
+        env = dataclasses.replace(env, physics=former.physics)
+    return env
 
 
 def fail(message: str, status: int = BAD_INPUT) -> None:

@@ -2,32 +2,42 @@
 
 Evolves intrinsic costs until agents stop violating the constraint. Everything about
 the run lands in one directory: configuration, metrics, TensorBoard events,
-checkpoints, the best cost and an HTML report.
+checkpoints, the best cost and an HTML report. Where a flag is not given, the preset's
+value holds.
 """
 
-import dataclasses
 import functools
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from autocost_jax.commandline import (
-    fail,
-    flag,
+    config_with,
     guarded,
     parse,
     quiet,
-    switch,
     use_compile_cache,
     use_devices,
-    with_env,
 )
-from autocost_jax.config import PRESETS, SearchConfig, preset
+from autocost_jax.config import SearchConfig, preset
 
 PROG = "python -m autocost_jax.evolve"
 PLANNED = {"laptop": 600.0}  # seconds that a preset promises on what it is for
+SETTINGS = (  # fields of the configuration that have a flag of their own
+    "physics",
+    "seed",
+    "algorithms",
+    "cost_limit",
+    "population_size",
+    "num_elites",
+    "num_stages",
+    "num_epochs",
+    "num_worlds",
+    "num_finalists",
+    "selection",
+)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -38,17 +48,19 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _main(argv: list[str]) -> None:
-    defaults = _defaults(argv)
-    options = parse(_options_type(), argv, PROG, default=defaults, description=__doc__)
+    options = parse(_options_type(), argv, PROG, description=__doc__)
+    flags = {name: getattr(options, name) for name in SETTINGS}
+    base = _base(options)
+    config = config_with(base, options.env, flags, options.set)
     use_compile_cache(options.compile_cache)
     # Before anything of JAX runs:
     group = (options.coordinator, options.num_processes, options.process_id)
     devices = use_devices(options.devices, *group)
-    config = options.search
     from autocost_jax.runs.search_run import describe, run_search
     from autocost_jax.viz.run_data import write_run_report
 
-    name = f"{options.preset}-{config.train.env.name}-seed{config.seed}"
+    sizes = options.preset or "laptop"
+    name = f"{sizes}-{config.train.env.name}-seed{config.seed}"
     path = options.out or Path("runs") / name
     if options.dry_run:
         print("\n".join([*describe(config, len(devices)), f"would write to {path}"]))
@@ -60,9 +72,25 @@ def _main(argv: list[str]) -> None:
         overwrite=options.overwrite,
         devices=devices,
         num_episodes=options.eval_episodes,
-        planned=_planned(options.preset, config),
+        planned=_planned(sizes, config),
         write_report=write_run_report,
     )
+
+
+def _base(options: Any) -> SearchConfig:
+    """What the flags come on top of: a preset, a file over it, or a run's settings."""
+    from autocost_jax.runs.config_files import read_settings, replace_fields
+    from autocost_jax.runs.directory import read_config
+
+    source = options.config
+    if source is None and options.resume and options.preset is None:
+        source = options.out
+    if source is None:
+        return preset(options.preset or "laptop")
+    if options.config is not None and source.is_file():
+        settings = read_settings(source)
+        return replace_fields(preset(options.preset or "laptop"), settings)
+    return read_config(source)[0]
 
 
 def _planned(name: str, config: SearchConfig) -> float | None:
@@ -81,60 +109,64 @@ def _options_type() -> Any:
         """Flags of the search.
 
         Attributes:
-          preset: laptop: 2 CPU cores, 10 minutes; search: one GPU; paper: the
-            paper's hyper-parameters; smoke: a test of the installation. The other
-            flags default to the preset's values.
-          config: run directory whose config.yaml replaces the preset's values.
+          preset: laptop (default): 2 CPU cores, 10 minutes; search: one GPU; paper: the
+            paper's hyper-parameters; smoke: a test of the installation.
+          config: YAML file of settings over the preset's, or run directory whose
+            settings replace them.
+          set: any setting by its name, as in `--set mutation_std=0.5`, once for each;
+            `autocost info --preset laptop` lists them.
           env: one of the worlds that `autocost info` lists.
+          physics: model of the world; closed_form, the fastest, for Points on a plane.
+          seed: of the search.
+          algorithms: that train every candidate.
+          cost_limit: allowed training cost per episode.
+          population_size: candidates of a stage.
+          num_elites: that are kept and mutated.
+          num_stages: of selection.
+          num_epochs: of training in a stage.
+          num_worlds: of a slot in an epoch.
+          num_finalists: that are trained again with fresh seeds after the last stage.
+          selection: the paper's, or the control that draws elites at random.
           out: run directory; default runs/PRESET-WORLD-seedN.
           resume: continue the run in `out` from its newest checkpoint.
           overwrite: start over in a directory that already holds a run.
+          dry_run: say what would be done, and stop.
+          eval_episodes: fresh episodes in which the best cost's agents are scored.
           devices: devices to use; default: all; a CPU counts one a core.
           coordinator: of a run in several processes, HOST:PORT of the first one, or
             auto under SLURM and the like; start the command once for each of them.
           num_processes: of such a run; leave out with auto.
           process_id: of this one, from 0; leave out with auto.
           compile_cache: keep compiled programs in the user's cache directory.
-          dry_run: say what would be done, and stop.
-          eval_episodes: fresh episodes in which the best cost's agents are scored.
-          search: the search's settings.
         """
 
-        preset: Literal["laptop", "search", "paper", "smoke"] = "laptop"
+        preset: Literal["laptop", "search", "paper", "smoke"] | None = None
         config: Path | None = None
+        set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
         env: str | None = None
+        physics: Literal["reduced", "full", "closed_form"] | None = None
+        seed: int | None = None
+        algorithms: tuple[Literal["ppo_lagrangian", "cpo"], ...] | None = None
+        cost_limit: float | None = None
+        population_size: int | None = None
+        num_elites: int | None = None
+        num_stages: int | None = None
+        num_epochs: int | None = None
+        num_worlds: int | None = None
+        num_finalists: int | None = None
+        selection: Literal["paper", "random"] | None = None
         out: Path | None = None
         resume: bool = False
         overwrite: bool = False
+        dry_run: bool = False
+        eval_episodes: int = 100
         devices: int | None = None
         coordinator: str | None = None
         num_processes: int | None = None
         process_id: int | None = None
         compile_cache: bool = True
-        dry_run: bool = False
-        eval_episodes: int = 100
-        search: Annotated[SearchConfig, tyro.conf.OmitArgPrefixes] = field(
-            default_factory=SearchConfig
-        )
 
     return Options
-
-
-def _defaults(argv: list[str]) -> Any:
-    """Options with the values of a preset or of a run; on --resume of that run."""
-    name = flag(argv, "--preset") or "laptop"
-    if name not in PRESETS:
-        fail(f"{PROG}: unknown preset {name!r}; presets: {', '.join(PRESETS)}")
-    config = preset(name)
-    out, source = flag(argv, "--out"), flag(argv, "--config")
-    if source is None and switch(argv, "--resume") and flag(argv, "--preset") is None:
-        source = out
-    if source is not None:
-        from autocost_jax.runs.directory import read_config
-
-        config, _ = read_config(Path(source))
-    config = dataclasses.replace(config, train=with_env(config.train, argv))
-    return _options_type()(preset=name, search=config)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ JSON knows no non-finite numbers: they are the strings "NaN", "Infinity" and
 import contextlib
 import dataclasses
 import datetime
+import difflib
 import hashlib
 import importlib.metadata
 import json
@@ -79,6 +80,43 @@ def from_dict(cls: type[C], data: Any, name: str = "") -> C:
     hints = get_type_hints(cls)
     values = {key: _decode(data[key], hints[key], _join(name, key)) for key in names}
     return cls(**values)
+
+
+def replace_fields(config: C, values: Mapping[str, Any]) -> C:
+    """A config with other values of some fields, those of nested configs included.
+
+    No two fields of a config have the same name, so that none needs its path; they may
+    stand below the names of their configs all the same, as in YAML.
+
+    Args:
+      config: a nested config dataclass; it is not changed.
+      values: name -> value as `to_dict` has it, or name of a config -> mapping.
+
+    Raises:
+      ValueError: no such field, with the names that are nearest; or a value that is
+        not allowed.
+    """
+    data = to_dict(config)
+    _put(_holders(data), values)
+    return from_dict(type(config), data)
+
+
+def read_settings(file: str | Path) -> dict[str, Any]:
+    """The mapping of a YAML file, for `replace_fields`.
+
+    Raises:
+      ValueError: it is not YAML, or not a mapping.
+      OSError: it cannot be read.
+    """
+    import yaml
+
+    try:
+        settings = yaml.safe_load(Path(file).read_text())
+    except (ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"{file} is not YAML: {error}") from None
+    if not isinstance(settings, dict):
+        raise ValueError(f"{file} must be a mapping of settings, got {settings!r}")
+    return settings
 
 
 def config_hash(config: Any) -> str:
@@ -195,6 +233,30 @@ def to_json(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return "NaN" if np.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return value
+
+
+def _holders(data: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The dict, out of nested ones, that holds each field."""
+    holders = dict.fromkeys(data, data)
+    for value in data.values():
+        holders |= _holders(value) if isinstance(value, dict) else {}
+    return holders
+
+
+def _put(holders: dict[str, dict[str, Any]], values: Mapping[str, Any]) -> None:
+    """Write values into the dicts that hold their fields."""
+    for name, value in values.items():
+        if name in holders and isinstance(value, Mapping):
+            _put(holders, value)
+        elif name in holders:
+            holders[name][name] = value
+        else:
+            near = difflib.get_close_matches(str(name), holders, 3, 0.4)
+            raise ValueError(
+                f"unknown setting {name!r}"
+                f"{'; the nearest: ' + ', '.join(near) if near else ''}"
+                "; `autocost info --preset NAME` lists all"
+            )
 
 
 def _difference(old: dict, new: dict, name: str) -> tuple[str, Any, Any] | None:
