@@ -12,6 +12,7 @@ from autocost_jax.cli import HELP
 from autocost_jax.config import ENVS
 from autocost_jax.envs.physics.models import scene_model
 from autocost_jax.evolve.__main__ import main as evolve_main
+from autocost_jax.runs.config_files import replace_fields
 from autocost_jax.search.starts import LOUD_COSTS, QUIET_PLACES
 from scripts import load_script
 
@@ -188,29 +189,15 @@ def test_the_results_of_the_readme_are_those_of_the_main_job():
         assert f"| {seed} | {' | '.join(cells)} |" in README
 
 
-@pytest.mark.parametrize(
-    "flag",
-    [
-        "--physics",
-        "--no-compile-cache",
-        "--segments-per-episode",
-        "--population-chunk",
-        "--critic-precision",
-        "--coordinator",
-        "--num-processes",
-        "--process-id",
-        "--start",
-        "--judge-by",
-        "--seeds-per-candidate",
-        "--pool-scores",
-        "--references",
-        "--num-finalists",
-        "--normalize-obs",
-        "--network",
-    ],
-)
-def test_flags_of_the_documents_exist(flag, capsys):
+def test_flags_and_settings_of_the_documents_exist(capsys):
     with pytest.raises(SystemExit):
         evolve_main(["--help"])
-    assert any(flag in page for page in DOCS.values())
-    assert flag in capsys.readouterr().out
+    text, pages = capsys.readouterr().out, " ".join(DOCS.values())
+    for flag in ("physics", "no-compile-cache", "coordinator", "num-processes"):
+        assert f"--{flag}" in pages
+        assert f"--{flag}" in text
+    names = re.findall(r"--set ([a-z_]+)=", pages) + re.findall(r"`(\w+): \w+`", pages)
+    assert {"segments_per_episode", "judge_by", "network"} <= set(names)
+    for name in names:
+        with pytest.raises(ValueError, match=f"{name} must be "):
+            replace_fields(preset("laptop"), {name: object()})
