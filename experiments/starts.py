@@ -11,7 +11,8 @@ all four are set, not drawn. Each cost trains both algorithms with three seeds o
 
 The second table asks what makes a stage's ranking mean something: the rank correlation
 (Spearman) of one seed's score after 40 or 48 epochs with the truth, which is how far
-the other two seeds are from success at the end.
+the other two seeds are from success at the end. Its last rule gives each cost a seed of
+its own, drawn anew 200 times; the bars come from one more seed.
 """
 
 import dataclasses
@@ -150,6 +151,28 @@ def rank_correlations(values: dict[str, np.ndarray]) -> list[dict[str, Any]]:
             found.append(float(spearmanr(score(after, seed), truth)[0]))  # pyright: ignore
         return found
 
+    def own_seeds(after: int, draws: int = 200) -> float:
+        """Each cost with one seed of its own against the truth of the others."""
+        rng, found = np.random.default_rng(0), []
+        seeds = range(num_seeds)
+        apart = [[other for other in seeds if other != seed] for seed in seeds]
+        truths = np.stack([distance(values, end, others) for others in apart])
+        costs = np.arange(truths.shape[1])
+        rate, ep_return = (
+            last(values[name], after) for name in ("violating_worlds", "ep_return")
+        )
+        for _ in range(draws):
+            mine, bars = (
+                rng.integers(num_seeds, size=len(costs)),
+                rng.integers(num_seeds),
+            )
+            score = shortfall(
+                rate[:, 2 + costs, mine], ep_return[:, 2 + costs, mine],
+                rate[:, 0, bars], ep_return[:, 0, bars],
+            )  # fmt: skip
+            found.append(spearmanr(score, truths[mine, costs])[0])  # pyright: ignore
+        return float(np.mean(found))
+
     rules = {
         "extrinsic cost": lambda after, seed: last(values["ep_cost"], after)[
             :, 2:, seed
@@ -159,11 +182,18 @@ def rank_correlations(values: dict[str, np.ndarray]) -> list[dict[str, Any]]:
         ),
         "success, in shares": lambda after, seed: distance(values, after, [seed]),
     }
+    lengths = [after for after in STAGES if after < end]
     return [
         {"rule": rule, "epochs": after, "by_seed": of(score, after)}
         for rule, score in rules.items()
-        for after in STAGES
-        if after < end
+        for after in lengths
+    ] + [
+        {
+            "rule": "success, in shares, a seed for each cost",
+            "epochs": after,
+            "by_seed": [own_seeds(after)],
+        }
+        for after in lengths
     ]
 
 
