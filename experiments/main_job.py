@@ -9,8 +9,8 @@ can be stopped and started again; finished ones are kept.
 
 Tests, stated before the runs: the mean extrinsic cost of the candidates falls from the
 first stage to the last (95 % bootstrap interval of the fall above 0; over places of the
-population, as each has its own training seed, the same in both stages) and ends below
-the control's; the last stage keeps a quarter of the reference's return. Of the best
+population, as each has its own training seed, the same in both stages; for each search
+and for all places of the searches together) and ends below the control's; the last stage keeps a quarter of the reference's return. Of the best
 cost's agents, trained with fresh seeds for the preset's length, at most a quarter as
 many episodes violate as with the extrinsic cost alone, at 30 % of its return or more,
 for each algorithm.
