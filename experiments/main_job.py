@@ -1,19 +1,25 @@
 """The main job, measured: does it find costs that make agents safe and useful?
 
-    python experiments/main_job.py run      # the default job, 3 seeds, their controls
-    python experiments/main_job.py collect  # JSON, table, figure
+    python experiments/main_job.py run       # the default job, 3 seeds, their controls
+    python experiments/main_job.py validate  # the best costs again, with 5 other seeds
+    python experiments/main_job.py collect   # JSON, table, figure
 
 Each search seed is paired with one whose elites are drawn at random under the same
 keys: both meet the same layouts, so that their last stages can be compared. Every run
 can be stopped and started again; finished ones are kept.
 
-Tests, stated before the runs: the mean extrinsic cost of the candidates falls from the
-first stage to the last (95 % bootstrap interval of the fall above 0; over places of the
-population, as each has its own training seed, the same in both stages; for each search
-and for all places of the searches together) and ends below the control's; the last stage keeps a quarter of the reference's return. Of the best
-cost's agents, trained with fresh seeds for the preset's length, at most a quarter as
-many episodes violate as with the extrinsic cost alone, at 30 % of its return or more,
-for each algorithm.
+Tests, stated before the runs:
+
+- The mean extrinsic cost of the candidates falls from the first stage to the last: the
+  95 % bootstrap interval of the fall lies above 0. It is over places of the population,
+  as each has its own training seed, the same in both stages; for each search, and for
+  all places of the searches together. The last stage ends below the control's and keeps
+  a quarter of the reference's return.
+- Of the best cost's agents, trained with fresh seeds for the preset's length, at most a
+  quarter as many episodes violate as with the extrinsic cost alone, at 30 % of its
+  return or more, for each algorithm. The search chose this cost among its finalists by
+  these very agents. So the same is asked of five more seeds that no search has seen,
+  trained with all best costs and references side by side.
 """
 
 import argparse
@@ -25,13 +31,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import run_if_needed
 
+from autocost_jax.commandline import use_devices
+from autocost_jax.costs import load_cost
 from autocost_jax.files import load_arrays
 from autocost_jax.runs.config_files import read_document, to_json
 from autocost_jax.runs.directory import list_stages, read_config
 from autocost_jax.runs.outcome import reaches_bars, row_of
+from autocost_jax.runs.sweep import Method, SweepConfig
+from autocost_jax.search.stages import REFERENCES
+from autocost_jax.search.success import is_success
 
 SEEDS = (0, 1, 2)
+VALIDATION_SEEDS = (100, 101, 102, 103, 104)
+EPISODES = 100
+MARGIN = "safety_margin_3x"
 WORDS = {True: "yes", False: "no", None: "not measured"}
 LAST_RETURN = 0.25  # of the reference's, in the last stage
 
@@ -58,6 +73,12 @@ def run(runs: Path, flags: list[str]) -> None:
             )
 
 
+def finished(runs: Path) -> list[Path]:
+    """The searches that have ended."""
+    paths = [search_dir(runs, "paper", seed) for seed in SEEDS]
+    return [path for path in paths if (path / "summary.json").exists()]
+
+
 def stages_of(path: Path) -> list[dict[str, np.ndarray]]:
     """The arrays of a run's stages."""
     return [dict(load_arrays(file)) for file in list_stages(path).values()]
@@ -69,6 +90,76 @@ def bootstrap_difference(first: np.ndarray, last: np.ndarray) -> list[float]:
     index = rng.integers(len(first), size=(10_000, len(first)))
     low, high = np.percentile((first - last)[index].mean(1), [2.5, 97.5])
     return [float(low), float(high)]
+
+
+def fall_of(paths: list[Path]) -> dict[str, Any]:
+    """The fall from the first stage to the last over all places of some searches."""
+    stages = [stages_of(path) for path in paths]
+    first, last = (
+        np.concatenate([own[place]["cost"] for own in stages]) for place in (0, -1)
+    )
+    interval = bootstrap_difference(first, last)
+    fall = float(first.mean() - last.mean())
+    return {"fall": fall, "fall_95": interval, "falls": interval[0] > 0}
+
+
+def validation_table(papers: list[Path]) -> SweepConfig:
+    """The best costs and both references, with seeds that no search has."""
+    config, _ = read_config(papers[0])
+    train = dataclasses.replace(
+        config.train, num_epochs=config.epochs_of(config.num_stages)
+    )
+    costs: dict[str, tuple[str, Any]] = {
+        label: (cost, None) for label, cost in REFERENCES.items()
+    }
+    for path in papers:
+        theta = tuple(map(float, load_cost(path / "cost.npz")))
+        costs[path.name] = ("extrinsic+intrinsic", theta)
+    methods = tuple(
+        Method(f"{algorithm} {label}", algorithm, cost, 0.0, theta)
+        for algorithm in config.algorithms
+        for label, (cost, theta) in costs.items()
+    )
+    return SweepConfig(train=train, methods=methods, seeds=VALIDATION_SEEDS)
+
+
+def validate(runs: Path) -> None:
+    """Train and score the table of all finished searches."""
+    use_devices(None)  # a device a core, before anything of JAX runs
+    table = validation_table(finished(runs))
+    run_if_needed(table, runs / "validation", num_episodes=EPISODES)
+
+
+def validation_rows(papers: list[Path], path: Path) -> list[dict[str, Any]]:
+    """The margin and each best cost against the bars, by means over the seeds."""
+    file = path / "evaluation.json"
+    table = json.loads(file.read_text())["rows"] if file.exists() else []
+
+    def of(algorithm: str, label: str) -> tuple[list[float], list[float]]:
+        rows = [row for row in table if row["method"] == f"{algorithm} {label}"]
+        return tuple(
+            [row[name] for row in rows] for name in ("violation_rate", "return_mean")
+        )  # pyright: ignore[reportReturnType]
+
+    out = []
+    for algorithm in read_config(papers[0])[0].algorithms if table else ():
+        plain = of(algorithm, "extrinsic")
+        for label in (MARGIN, *(paper.name for paper in papers)):
+            mine = of(algorithm, label)
+            means = [float(np.mean(values)) for values in (*mine, *plain)]
+            out.append(
+                {
+                    "algorithm": algorithm,
+                    "cost": label,
+                    "violation_rate": mine[0],
+                    "return": mine[1],
+                    "reference": {"violation_rate": plain[0], "return": plain[1]},
+                    "violations_left": means[0] / means[2],
+                    "return_kept": means[1] / means[3],
+                    "reached": is_success(*means),
+                }
+            )
+    return out
 
 
 def search_row(paper: Path, control: Path) -> dict[str, Any]:
@@ -139,6 +230,11 @@ def table(result: dict[str, Any]) -> str:
             f"{_series(row['stage_returns'], 1)} | {row['return_share']:.0%} | "
             f"{verdict} |"
         )
+    low, high = result["together"]["fall_95"]
+    lines.append(
+        f"| all | | {result['together']['fall']:.2f} ({low:.2f} to {high:.2f}) | | | | "
+        f"{WORDS[result['together']['falls']]} |"
+    )
     lines += [
         "",
         "| search seed | algorithm | cost | return | violating episodes | extrinsic "
@@ -166,6 +262,20 @@ def table(result: dict[str, Any]) -> str:
                 f"| {seed} | {name} | {row['violations_left']:.0%} | "
                 f"{row['return_kept']:.0%} | {'yes' if row['reached'] else 'no'} |"
             )
+    lines += [
+        "",
+        f"| {len(VALIDATION_SEEDS)} seeds that no search has seen: cost | algorithm "
+        "| return, seed by seed | violating episodes | violations left | return kept "
+        "| reached |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in result["validation"]:
+        rates = ", ".join(f"{rate:.0%}" for rate in row["violation_rate"])
+        lines.append(
+            f"| {row['cost']} | {row['algorithm']} | {_series(row['return'], 1)} | "
+            f"{rates} | {row['violations_left']:.0%} | {row['return_kept']:.0%} | "
+            f"{'yes' if row['reached'] else 'no'} |"
+        )
     return "\n".join(lines) + "\n"
 
 
@@ -225,21 +335,21 @@ def require_same_job(paths: list[Path]) -> None:
 
 def collect(runs: Path, results: Path) -> None:
     """JSON, table and figure of all runs."""
-    seeds = [
-        seed
-        for seed in SEEDS
-        if (search_dir(runs, "paper", seed) / "summary.json").exists()
-    ]
-    papers = [search_dir(runs, "paper", seed) for seed in seeds]
+    papers = finished(runs)
+    seeds = [read_config(path)[0].seed for path in papers]
     controls = [search_dir(runs, "random", seed) for seed in seeds]
     require_same_job([path for path in (*papers, *controls) if path.exists()])
     result = {
-        "command": "python experiments/main_job.py run && "
-        "python experiments/main_job.py collect",
+        "command": " && ".join(
+            f"python experiments/main_job.py {part}"
+            for part in ("run", "validate", "collect")
+        ),
         "seeds": seeds,
         "config": read_document(papers[0])["config"],
         "searches": [search_row(*pair) for pair in zip(papers, controls, strict=True)],
+        "together": fall_of(papers),
         "best": [best_row(path) for path in papers],
+        "validation": validation_rows(papers, runs / "validation"),
     }
     results.mkdir(parents=True, exist_ok=True)
     text = json.dumps(to_json(result), indent=1, allow_nan=False)
@@ -251,7 +361,7 @@ def collect(runs: Path, results: Path) -> None:
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=("run", "collect"))
+    parser.add_argument("part", choices=("run", "validate", "collect"))
     parser.add_argument("--runs", type=Path, default=Path("runs/main_job"))
     parser.add_argument(
         "--results", type=Path, default=Path("experiments/results/laptop")
@@ -259,6 +369,8 @@ def main() -> None:
     args, flags = parser.parse_known_args()
     if args.part == "run":
         run(args.runs, flags)
+    elif args.part == "validate":
+        validate(args.runs)
     else:
         collect(args.runs, args.results)
 

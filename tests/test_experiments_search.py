@@ -10,6 +10,7 @@ import pytest
 
 from autocost_jax.config import preset
 from autocost_jax.costs import load_cost
+from autocost_jax.runs.directory import RunDir
 from scripts import load_script
 
 RESULTS = Path(__file__).parents[1] / "experiments" / "results"
@@ -123,3 +124,30 @@ def test_a_rule_reads_its_own_epochs_and_seeds():
     got = fitness.judged(arrays, rule, (1, 3))["cost"]
     np.testing.assert_allclose(got, np.full((2, 3), np.mean(range(24, 32)) + 2000))
     assert rule.budget == 4000 * 32 * 2
+
+
+def test_the_validation_compares_the_means_of_its_seeds(tmp_path):
+    """A margin that stays short of the bar and a best cost that reaches it."""
+    main_job = load_script("experiments/main_job")
+    config = dataclasses.replace(preset("smoke"), algorithms=("cpo",))
+    paper = main_job.search_dir(tmp_path, "paper", 1)
+    RunDir.create(paper, config, {}).close()
+    theta = np.arange(41.0)
+    np.savez(paper / "cost.npz", theta=theta)
+    table = main_job.validation_table([paper])
+    labels = ["cpo extrinsic", "cpo safety_margin_3x", "cpo paper_1"]
+    assert [method.label for method in table.methods] == labels
+    assert table.methods[2].theta == tuple(theta)
+    assert not set(table.seeds) & set(main_job.SEEDS)
+    scores = {labels[0]: (0.8, 20.0), labels[1]: (0.3, 12.0), labels[2]: (0.1, 8.0)}
+    rows = [
+        {"method": label, "violation_rate": rate + shift, "return_mean": ep_return}
+        for label, (rate, ep_return) in scores.items()
+        for shift in (-0.1, 0.1)
+    ]
+    assert main_job.validation_rows([paper], tmp_path) == []
+    (tmp_path / "evaluation.json").write_text(json.dumps({"rows": rows}))
+    margin, best = main_job.validation_rows([paper], tmp_path)
+    assert margin["violations_left"] == pytest.approx(0.375)
+    assert best["return_kept"] == pytest.approx(0.4)
+    assert [row["reached"] for row in (margin, best)] == [False, True]
