@@ -153,19 +153,18 @@ BAD = {
         "final_epochs": NUMBER,
     },
 }
-CASES = [
-    pytest.param(kind, name, value, id=f"{kind.__name__}.{name}={value!r}")
-    for kind, fields in BAD.items()
-    for name, values in fields.items()
-    for value in values
-]
 
 
-@pytest.mark.parametrize(("kind", "name", "value"), CASES)
-def test_a_bad_value_is_refused_by_name(kind, name, value):
-    with pytest.raises(ValueError, match=rf"^{name} must be .*, got ") as caught:
-        kind(**{name: value})
-    assert "\n" not in str(caught.value)
+def test_bad_values_are_refused_by_name():
+    for kind, fields in BAD.items():
+        for name, values in fields.items():
+            for value in values:
+                with pytest.raises(ValueError, match=r"must be") as caught:
+                    kind(**{name: value})
+                message = str(caught.value)
+                assert message.startswith(f"{name} must be "), (kind, name, value)
+                assert ", got " in message
+                assert "\n" not in message
 
 
 @pytest.mark.parametrize("kind", BAD)
