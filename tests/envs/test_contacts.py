@@ -29,6 +29,7 @@ from autocost_jax.records import Layout
 FLOAT64 = 1e-9
 # From the first contact on the record has two contacts with a pillar, the scene one.
 LEANING = 2e-4
+ONSET_XY = 5e-3  # of MJX in the recorded runs
 SOLVER = 1e-6  # what the solver's tolerance leaves undecided of a box's motion
 NORMAL = 5e-3  # rad, 90 % of the scene's contacts; a searched normal, not a formula's
 NUM = 200  # worlds; one batch size, so that each function compiles once
@@ -354,7 +355,7 @@ def point_drives() -> tuple[Layout, scenes.Policy]:
 
 
 def test_point_meets_pillars_when_the_scene_does():
-    """The first contact, and where the robot then leans."""
+    """The first contact, and where the robot then leans; one world is recorded."""
     world = compiled("Goal-Pillar-Point")
     layouts, policy = point_drives()
     num_steps = 80
@@ -374,6 +375,13 @@ def test_point_meets_pillars_when_the_scene_does():
     head_on = got.touches[:, kinds == 0]
     np.testing.assert_array_equal(head_on, expected.touches[:, kinds == 0])
     assert np.mean(got.touches == expected.touches) > 0.9
+    recorded = load("pillar_head_on")
+    np.testing.assert_array_equal(layouts.pillars[0][0], recorded["pillar"])
+    seen = recorded["contact"][1 : num_steps + 1]
+    assert seen.any()
+    np.testing.assert_array_equal(got.touches[:, 0], seen)
+    error = got.qpos[:, 0, :2] - recorded["qpos"][1 : num_steps + 1, :2]
+    assert np.abs(error).max() < ONSET_XY
 
 
 # The box has four feet for twenty and the arrow is a bar: single steps agree roughly,
@@ -404,7 +412,10 @@ def test_single_steps_of_a_point_at_the_box():
 
 
 def test_point_meets_the_box_when_the_scene_does():
-    """Straight, offset, rotated and far boxes, until five steps after the contact."""
+    """Straight, offset, rotated and far boxes, until five steps after the contact.
+
+    The first world is recorded.
+    """
     world = compiled("Push-Hazard-Point")
     config = world.env.config
     rng = np.random.default_rng(5)
@@ -432,6 +443,15 @@ def test_point_meets_the_box_when_the_scene_does():
         np.testing.assert_allclose(a, b, atol=1e-2)
         a, b = got.qpos[onset + 4, row, 3:5], expected.qpos[onset + 4, row, 3:5]
         np.testing.assert_allclose(a, b, atol=0.1)
+    recorded = load("push_point_straight")
+    np.testing.assert_array_equal(batch.box_xy[0], recorded["box0"])
+    onset = int(np.argmax(recorded["robot_box_contacts"] > 0))
+    seen, expected_qpos = got.qpos[: onset + 3, 0], recorded["qpos"][1 : onset + 4]
+    moved = np.abs(seen[:, 3:5] - recorded["box0"]).max(-1)
+    assert (moved[: onset - 1] < 1e-4).all()
+    assert moved[-1] > 1e-3
+    for part, slack in ((slice(0, 2), ONSET_XY), (slice(3, 5), 2 * ONSET_XY)):
+        np.testing.assert_allclose(seen[:, part], expected_qpos[:, part], atol=slack)
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
-"""Car, Doggo, a pillar and the box against recordings of the original engine."""
+"""Car and Doggo against recordings of the original engine."""
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from env_data import blank_layout, load, states_at
 
-from autocost_jax.config import EnvConfig, env_config
+from autocost_jax.config import EnvConfig
 from autocost_jax.envs.env import make_env
 from autocost_jax.envs.physics.models import scene_model
 
@@ -22,12 +21,6 @@ OPEN_LOOP_C = 1e-5
 # last digit they may differ by anything.
 NEARLY_ALL, NEAR, ALMOST_ALL, CLOSE = 0.90, 1e-3, 0.98, 2e-2  # design 6
 OBSERVED = 1e-2  # 90 % of the rows of every sensor; the accelerometer in m/s^2
-ONSET_XY = 5e-3
-
-
-def one_pillar() -> EnvConfig:
-    config = env_config("Goal-Pillar-Point")
-    return dataclasses.replace(config, pillars_num=1, lidar_num_bins=16)
 
 
 @pytest.mark.parametrize("robot", ["Car", "Doggo"])
@@ -92,61 +85,3 @@ def test_control_steps_from_recorded_states(robot):
         error = np.abs(got - expected).max(-1)
         assert np.quantile(error, NEARLY_ALL) < OBSERVED, key
         start += size
-
-
-def test_pillar_is_touched_when_the_record_says():
-    recorded = load("pillar_head_on")
-    config = one_pillar()
-    env = make_env(config)
-    layout = blank_layout(
-        config, pillars=recorded["pillar"][None], goal_xy=np.array([9.0, 9.0])
-    )
-    action = jnp.asarray(recorded["action"], jnp.float32)
-
-    def drive(state, _):
-        state = env.step(state, action)
-        return state, (state.data.qpos, state.cost)
-
-    state = env.reset_to(layout, jax.random.key(0))
-    run = jax.jit(lambda state: jax.lax.scan(drive, state, None, 300)[1])
-    qpos, cost = run(state)
-    assert recorded["contact"][1:].any()
-    np.testing.assert_array_equal(cost, recorded["cost_indicator"][1:])
-    np.testing.assert_allclose(qpos[:, :2], recorded["qpos"][1:, :2], atol=ONSET_XY)
-
-
-def test_box_is_pushed_as_recorded_until_shortly_after_contact():
-    recorded = load("push_point_straight")
-    config = dataclasses.replace(env_config("Push-Hazard-Point"), hazards_num=1)
-    env = make_env(config)
-    layout = blank_layout(
-        config,
-        hazards=np.array([[9.0, 9.0]]),
-        goal_xy=recorded["goal"],
-        box_xy=recorded["box0"],
-        box_yaw=recorded["box_rot0"],
-    )
-    assert float(env.mj_model.body("box").mass[0]) == pytest.approx(
-        float(recorded["box_mass"])
-    )
-    onset = int(np.argmax(recorded["robot_box_contacts"] > 0))
-    steps = onset + 3
-    action = jnp.asarray(recorded["action"], jnp.float32)
-
-    def push(state, _):
-        state = env.step(state, action)
-        return state, (state.data.qpos, state.reward)
-
-    state = env.reset_to(layout, jax.random.key(0))
-    run = jax.jit(lambda state: jax.lax.scan(push, state, None, steps)[1])
-    qpos, reward = run(state)
-    assert 0 < onset < 100
-    moved = np.abs(np.asarray(qpos[:, 3:5]) - recorded["box0"]).max(-1)
-    assert (moved[: onset - 1] < 1e-4).all()
-    assert moved[-1] > 1e-3
-    expected = recorded["qpos"][1 : steps + 1]
-    np.testing.assert_allclose(qpos[:, :2], expected[:, :2], atol=ONSET_XY)
-    np.testing.assert_allclose(qpos[:, 3:5], expected[:, 3:5], atol=2 * ONSET_XY)
-    np.testing.assert_allclose(
-        reward[: onset - 1], recorded["reward"][1:onset], atol=1e-5
-    )
