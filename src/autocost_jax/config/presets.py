@@ -14,8 +14,8 @@ _LAPTOP_AGENT = AgentConfig(
     policy_minibatches=8,
     value_passes=4,
     value_minibatches=8,
-    multiplier_init=0.5,
-    multiplier_lr=0.01,
+    multiplier_init=0.3,
+    multiplier_lr=0.005,
     cg_iterations=5,
 )
 
