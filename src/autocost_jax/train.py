@@ -382,9 +382,7 @@ def _update(
 
 
 def _all_finite(tree: Any) -> jax.Array:
-    flags = [
-        jnp.all(jnp.isfinite(leaf))
-        for leaf in jax.tree.leaves(tree)
-        if jnp.issubdtype(leaf.dtype, jnp.floating)
-    ]
-    return jnp.all(jnp.stack(flags))
+    """One check of all numbers: one of each leaf took a quarter of the program."""
+    leaves = [jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)]
+    floats = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.all(jnp.isfinite(jnp.concatenate(floats)))
