@@ -258,7 +258,7 @@ def _carry(
     )
 
 
-def slots_at_once(config: TrainConfig, num_slots: int) -> int:
+def population_chunk(config: TrainConfig, num_slots: int) -> int:
     """How many of a device's slots of one algorithm learn side by side.
 
     Unless the configuration says: on a CPU one after the other, whose arrays then stay
@@ -269,9 +269,9 @@ def slots_at_once(config: TrainConfig, num_slots: int) -> int:
 
 
 def _map_slots(config: TrainConfig, function: Callable[..., Any], inputs: Any) -> Any:
-    """`function` of each slot of inputs [P, ...], `slots_at_once` side by side."""
+    """`function` of each slot of inputs [P, ...], `population_chunk` side by side."""
     num_slots = jax.tree.leaves(inputs)[0].shape[0]
-    chunk = slots_at_once(config, num_slots)
+    chunk = population_chunk(config, num_slots)
     if chunk == 1:  # without the axis of length 1 that `batch_size` would carry along
         return jax.lax.map(lambda slot: function(*slot), inputs)
     if chunk == num_slots:

@@ -47,7 +47,7 @@ from autocost_jax.search.evolution import (
     slots_of,
 )
 from autocost_jax.search.stages import StageResult
-from autocost_jax.train import slots_at_once
+from autocost_jax.train import population_chunk
 
 
 def estimate_memory(config: SearchConfig, num_devices: int) -> int:
@@ -67,7 +67,7 @@ def estimate_memory(config: SearchConfig, num_devices: int) -> int:
     activations = 4 * batch * width * len(config.train.agent.hidden_sizes)
     per_slot = 2 * row * rows + 4 * 3 * 3 * weights
     here = -(-slots // num_devices)
-    at_once = slots_at_once(config.train, -(-config.slots_per_algorithm // num_devices))
+    at_once = population_chunk(config.train, -(-config.slots_per_algorithm // num_devices))
     return 4 * (per_slot * here + activations * at_once)
 
 
