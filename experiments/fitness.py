@@ -39,6 +39,7 @@ from autocost_jax.files import flatten
 from autocost_jax.population import Population, make_agents, make_population
 from autocost_jax.records import Slot
 from autocost_jax.runs.directory import run_facts
+from autocost_jax.train import EpochState
 
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 REFERENCES = ("extrinsic", "extrinsic+safety_margin_3x")
@@ -107,40 +108,42 @@ def make_slots(theta: np.ndarray, size: Size, first_seed: int) -> tuple[Slot, ..
 
 def train(
     population: Population,
-    learners: Any,
+    state: EpochState,
     slots: Any,
     epochs: int,
     what: str,
     seconds: float = np.inf,
-) -> tuple[Any, dict[str, np.ndarray]]:
-    """Learners after so many epochs or seconds, and `KEPT` metrics [E, A, C * S]."""
+) -> tuple[EpochState, dict[str, np.ndarray]]:
+    """The state after so many epochs or seconds, and `KEPT` metrics [E, A, C * S]."""
     rows, start = [], time.monotonic()
     for epoch in range(epochs):
         if time.monotonic() - start > seconds:
             print(f"{what}: stopped after {epoch} epochs", flush=True)
             break
-        learners, metrics = population.chunk(learners, slots, epoch)
+        state, metrics = population.chunk(state, slots, epoch)
         rows.append([{name: group[name][0] for name in KEPT} for group in metrics])
         jax.block_until_ready(metrics)
         if epoch % 16 == 0:
             print(f"{what} {epoch}: {time.monotonic() - start:.0f} s", flush=True)
     rows = jax.device_get(rows)
     kept = {name: np.asarray([[g[name] for g in r] for r in rows]) for name in KEPT}
-    return learners, kept
+    return state, kept
 
 
-def warm_start(population: Population, learners: Any, slots: Any, size: Size) -> Any:
+def warm_start(
+    population: Population, trained: EpochState, slots: Any, size: Size
+) -> EpochState:
     """Fresh learners with the networks of the extrinsic cost's agents, by seed."""
     fresh = population.init(slots)
     groups = []
-    for new, old in zip(fresh, learners, strict=True):
+    for new, old in zip(fresh.learners, trained.learners, strict=True):
         index = np.tile(np.arange(size.seeds), new.frozen.shape[0] // size.seeds)
         taken = jax.tree.map(lambda leaf, index=index: leaf[index], old.agent)
         agent = new.agent.replace(
             policy=taken.policy, critic=taken.critic, normalizer=taken.normalizer
         )
         groups.append(new.replace(agent=agent))
-    return tuple(groups)
+    return EpochState(tuple(groups))
 
 
 def run(path: Path, size: Size, config: TrainConfig, seconds: float) -> None:
@@ -159,17 +162,17 @@ def run(path: Path, size: Size, config: TrainConfig, seconds: float) -> None:
         np.savez_compressed(path / "fitness.npz", **arrays)
 
     slots = make_slots(theta, size, 100)
-    learners, metrics = train(
+    state, metrics = train(
         population, population.init(slots), slots, size.short, "short"
     )
     keep("short", metrics)
     slots = make_slots(theta, size, 200)
-    learners = warm_start(population, learners, slots, size)
-    learners, metrics = train(population, learners, slots, size.warm, "warm")
+    state = warm_start(population, state, slots, size)
+    state, metrics = train(population, state, slots, size.warm, "warm")
     keep("warm", metrics)
     slots = make_slots(theta, size, 0)
     left = seconds - (time.monotonic() - begin)
-    learners, metrics = train(
+    state, metrics = train(
         population, population.init(slots), slots, size.truth, "truth", left
     )
     keep("truth", metrics)
@@ -183,13 +186,13 @@ def run(path: Path, size: Size, config: TrainConfig, seconds: float) -> None:
     )
     template = agents[0].init(jax.random.key(0))
     results, policies = [], {}
-    for name, group in zip(ALGORITHMS, learners, strict=True):
+    for name, group in zip(ALGORITHMS, state.learners, strict=True):
         acting = actor(jax.device_get(group.agent))
         count = len(theta) * size.seeds
-        state = jax.tree.map(
+        agent = jax.tree.map(
             lambda x, n=count: jnp.broadcast_to(x, (n, *x.shape)), template
         )
-        results.append(score(state.replace(**acting._asdict()), jax.random.key(99)))
+        results.append(score(agent.replace(**acting._asdict()), jax.random.key(99)))
         first = jax.tree.map(lambda x: x[:: size.seeds], acting)
         policies |= {f"{name}/{key}": x for key, x in flatten(first).items()}
     for field in ("ep_return", "ep_cost"):

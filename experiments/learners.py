@@ -93,10 +93,10 @@ def run_one(name: str, out: Path, smoke: bool) -> None:
     agents = make_agents(config.algorithms, train, env)
     population = make_population(env, agents, train, devices=devices)
     slots = sweep_slots(config)
-    learners = population.init(slots)
+    state = population.init(slots)
     start = time.monotonic()
     for epoch in range(train.num_epochs):
-        learners, metrics = population.chunk(learners, slots, epoch)
+        state, metrics = population.chunk(state, slots, epoch)
         if epoch == 0:
             jax.block_until_ready(metrics)
             start = time.monotonic()
@@ -110,7 +110,7 @@ def run_one(name: str, out: Path, smoke: bool) -> None:
     )
     template = agents[0].init(jax.random.key(0))
     rows = []
-    for algorithm, learner in zip(config.algorithms, learners, strict=True):
+    for algorithm, learner in zip(config.algorithms, state.learners, strict=True):
         group = config.group(algorithm)
         acting = actor(jax.device_get(learner.agent))
         size = len(group)

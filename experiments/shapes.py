@@ -134,9 +134,9 @@ def train(shapes: Sequence[Shape], scale: paper.Scale) -> Iterator[dict[str, Any
     group = stack_slots([slot(shape, seed) for shape in shapes for seed in SEEDS])
     slots = tuple(group for _ in agents)
     population = make_population(env, agents, config, SHAPES, jax.devices())
-    learners, history = population.init(slots), []
+    state, history = population.init(slots), []
     for epoch in range(0, config.num_epochs, config.chunk_epochs):
-        learners, metrics = population.chunk(learners, slots, epoch)
+        state, metrics = population.chunk(state, slots, epoch)
         history.append(jax.tree.map(np.asarray, population.fetch(metrics)))
         print(f"epoch {epoch + config.chunk_epochs} of {config.num_epochs}", flush=True)
     whole = jax.tree.map(lambda *chunks: np.concatenate(chunks), *history)

@@ -198,9 +198,9 @@ def test_a_graded_start_keeps_to_other_ranges(key, places):
 def test_a_search_hands_its_world_to_its_start(key):
     config = preset("smoke")
     sizes = {"population_size": 12, "num_elites": 2, "num_finalists": 0}
-    es = make_strategy(dataclasses.replace(config, start="graded", **sizes))
-    first = jax.jit(es.ask)(key, es.init())
     env = make_env(config.train.env)
+    es = make_strategy(dataclasses.replace(config, start="graded", **sizes), env)
+    first = jax.jit(es.ask)(key, es.init())
     places = jax.jit(lambda key: typical_lidars(env, key))(jax.random.key(0))
     costs = jax.vmap(lambda theta: intrinsic_cost(theta, places))
     quiet = 100 * np.mean(np.asarray(costs(first)) < QUIET_COST, axis=1)

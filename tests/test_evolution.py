@@ -306,10 +306,11 @@ def test_a_frozen_agent_costs_everything():
 def poison(searcher, broken):
     """A state before the first chunk, with NaN parameters in some slots."""
     state = init_search(searcher)
-    group = state.learners[0]
+    group, *others = state.training.learners
     weights = group.agent.weights.at[np.array(broken)].set(jnp.nan)
     group = group.replace(agent=group.agent.replace(weights=weights))
-    return state.replace(learners=(group, *state.learners[1:]))
+    training = state.training.replace(learners=(group, *others))
+    return state.replace(training=training)
 
 
 def test_a_frozen_candidate_is_never_an_elite(searcher):
@@ -466,8 +467,8 @@ def test_each_place_may_have_its_own_seeds_in_all_stages(key):
     rest = np.setdiff1d(np.arange(24), own)
     np.testing.assert_array_equal(later[rest], keys_of(shared, 1, candidates)[rest])
     assert not (first[rest] == later[rest]).all(-1).any()
-    final = (keys_of(c, 2, candidates, is_final=True) for c in (config, shared))
-    np.testing.assert_array_equal(*final)
+    one, two = (keys_of(c, 2, candidates, is_final=True) for c in (config, shared))
+    np.testing.assert_array_equal(one, two)
 
 
 FINALS = dataclasses.replace(

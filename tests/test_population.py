@@ -20,7 +20,7 @@ from autocost_jax.population import (
     remake_empty,
     stack_slots,
 )
-from autocost_jax.train import final_episodes, init_learner, run_stage
+from autocost_jax.train import EpochState, final_episodes, init_learner, run_stage
 from toys import (
     TRAIN,
     Counter,
@@ -52,15 +52,15 @@ def program(counter):
     return make_population(env, agents, TRAIN)
 
 
-def run(program, slots, learners=None, epochs=EPOCHS):
+def run(program, slots, state=None, epochs=EPOCHS):
     """Learners and metrics [E, P] of each group after some epochs, as NumPy."""
-    learners = program.init(slots) if learners is None else learners
+    state = program.init(slots) if state is None else state
     rows = []
     for epoch in range(epochs):
-        learners, metrics = program.chunk(learners, slots, epoch)
+        state, metrics = program.chunk(state, slots, epoch)
         rows.append(metrics)
     metrics = jax.tree.map(lambda *x: np.concatenate(x), *rows)
-    return jax.tree.map(np.asarray, learners), metrics
+    return jax.tree.map(np.asarray, state.learners), metrics
 
 
 def groups(size=SIZE):
@@ -128,8 +128,8 @@ def poison_parameters(slots, learners):
 
 @pytest.mark.parametrize("poison", [poison_theta, poison_parameters])
 def test_a_nan_neighbour(program, reference, poison):
-    slots, learners = poison(groups(), program.init(groups()))
-    sick = run(program, slots, learners)
+    slots, learners = poison(groups(), program.init(groups()).learners)
+    sick = run(program, slots, EpochState(learners))
     healthy = np.array([0, 2, 3])
     assert_same_bits(lanes(sick, healthy), lanes(reference, healthy))
     frozen = [group.frozen[1] for group in sick[0]]
@@ -164,9 +164,9 @@ def wide():
     slots = jax.tree.map(
         lambda one, two: jnp.concatenate([one, two]), groups(), groups()[::-1]
     )
-    learners = program.init(slots)
-    text = program.compile(learners, slots).as_text()
-    return text, run(program, slots, learners, epochs=1)
+    state = program.init(slots)
+    text = program.compile(state, slots).as_text()
+    return text, run(program, slots, state, epochs=1)
 
 
 def test_another_population_size(program, wide):
@@ -218,11 +218,11 @@ for count in (1, 2, 3, 8):
     program = make_population(env, agents, TRAIN, devices=jax.devices()[:count])
     assert program.num_devices == count
     slots = groups(3)
-    learners = program.init(slots)
-    text = program.compile(learners, slots).as_text()
+    state = program.init(slots)
+    text = program.compile(state, slots).as_text()
     names = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"
     collectives[count] = sorted(set(re.findall(names, text)))
-    result = run(program, slots, learners, epochs=1)
+    result = run(program, slots, state, epochs=1)
     np.savez({out!r} + f"/{{count}}.npz", **flatten(result))
 if {toy!r}:  # carried worlds have no pillars: an array without elements goes in and out
     config = train_config(segments_per_episode=2)
@@ -306,11 +306,11 @@ def test_cohorts_travel_with_their_learners():
     agents = make_agents(ALGORITHMS, config, env)
     program = make_population(env, agents, config, final_rounds=3)
     slots = groups()
-    learners = program.init(slots)
-    for group in learners:
-        assert group.worlds is not None
-        assert group.worlds.age.shape == (SIZE, config.num_worlds)
-        assert (np.asarray(group.worlds.age) == config.epoch_steps).all()
+    state = program.init(slots)
+    assert state.worlds is not None
+    for worlds in state.worlds:
+        assert worlds.age.shape == (SIZE, config.num_worlds)
+        assert (np.asarray(worlds.age) == config.epoch_steps).all()
 
     @jax.jit
     def whole(slots):
@@ -324,9 +324,9 @@ def test_cohorts_travel_with_their_learners():
     expected, expected_final = whole(slots)
     rows = []
     for epoch in range(EPOCHS):
-        learners, metrics = program.chunk(learners, slots, epoch)
+        state, metrics = program.chunk(state, slots, epoch)
         rows.append(metrics)
-    final = program.final(learners, slots)
+    final = program.final(state, slots)
     metrics = jax.tree.map(lambda *x: np.concatenate(x), *rows)
     for got, want in ((metrics, expected), (final, expected_final)):
         for group, reference in zip(got, want, strict=True):
@@ -372,11 +372,11 @@ def test_a_compiled_program_runs_for_its_own_sizes_alone(caplog):
         slots = groups(size)
         caplog.clear()
         with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
-            learners, metrics = population.chunk(population.init(slots), slots, 0)
+            state, metrics = population.chunk(population.init(slots), slots, 0)
         lines = [record.getMessage() for record in caplog.records]
         assert sum("Compiling jit(chunk)" in line for line in lines) == compiles
         assert metrics[0]["ep_cost"].shape == (1, size)
-        assert len(learners[0].frozen) == size
+        assert len(state.learners[0].frozen) == size
 
 
 def test_candidates_share_their_random_numbers(key):

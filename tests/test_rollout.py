@@ -11,7 +11,7 @@ from autocost_jax.rollout import (
     reset_worlds,
     unroll,
 )
-from autocost_jax.train import init_learner, run_epoch, start_cohorts
+from autocost_jax.train import init_learner, run_epoch, start_epochs
 from toys import NUM_STEPS, RADIUS, intrinsic_slots, linear_agent, make_toy_env
 from toys import train_config as make_config
 
@@ -143,13 +143,13 @@ def test_cohorts_have_true_ages(segments):
 
     @jax.jit
     def epochs(learners):
-        def body(learners, epoch):
-            after, metrics = run_epoch(env, (agent,), config, learners, slots, epoch)
-            return after, (learners[0].worlds, after[0].worlds, metrics)
+        def body(state, epoch):
+            after, metrics = run_epoch(env, (agent,), config, state, slots, epoch)
+            return after, (state.worlds, after.worlds, metrics)
 
-        learners = start_cohorts(env, (agent,), config, learners, slots)
+        state = start_epochs(env, (agent,), config, learners, slots)
         numbers = jnp.arange(2 * segments, dtype=jnp.int32)
-        return jax.lax.scan(body, learners, numbers)[1]
+        return jax.lax.scan(body, state, numbers)[1]
 
     before, after, metrics = epochs(learners)
     assert metrics[0]["ep_return"].shape == (2 * segments, 2)
@@ -157,6 +157,7 @@ def test_cohorts_have_true_ages(segments):
         assert before is None
         assert after is None
         return
+    (before,), (after,) = before, after
     # Carried worlds [E, P, (k - 1) N]: one, two, ... segments old, oldest last.
     ages = epoch_steps * np.repeat(np.arange(1, segments), config.num_worlds)
     assert before.age.shape == (2 * segments, 2, ages.size)

@@ -15,6 +15,7 @@ from autocost_jax.metrics import cost_by_distance, episode_metrics
 from autocost_jax.population import stack_slots
 from autocost_jax.records import CostInputs, Slot, Trajectory
 from autocost_jax.train import (
+    EpochState,
     final_episodes,
     init_learner,
     run_epoch,
@@ -215,13 +216,13 @@ def test_a_broken_agent_keeps_its_last_finite_state(env):
 
     @jax.jit
     def epochs(learner):
-        def body(learner, epoch):
-            (learner,), (metrics,) = run_epoch(
-                env, (agent,), TRAIN, (learner,), (slots,), epoch
-            )
-            return learner, (learner, metrics["frozen"])
+        def body(state, epoch):
+            state, (metrics,) = run_epoch(env, (agent,), TRAIN, state, (slots,), epoch)
+            return state, (state.learners[0], metrics["frozen"])
 
-        return jax.lax.scan(body, learner, jnp.arange(5, dtype=jnp.int32))[1]
+        return jax.lax.scan(
+            body, EpochState((learner,)), jnp.arange(5, dtype=jnp.int32)
+        )[1]
 
     after, frozen = epochs(first)
     assert frozen.T.tolist() == [[0] * 5, [0, 0, 1, 1, 1], [1] * 5]
@@ -275,7 +276,12 @@ def test_an_environment_of_another_length_is_refused(function, segments):
         "train": lambda: train(env, agent, slot, config),
         "run_stage": lambda: run_stage(env, (agent,), config, fresh, slots),
         "run_epoch": lambda: run_epoch(
-            env, (agent,), config, fresh, slots, jnp.zeros((), jnp.int32)
+            env,
+            (agent,),
+            config,
+            EpochState(fresh),
+            slots,
+            jnp.zeros((), jnp.int32),
         ),
         "final": lambda: final_episodes(env, (agent,), config, fresh, slots, 1),
     }

@@ -191,9 +191,9 @@ def compile_times(config: SearchConfig, devices: Sequence[Any]) -> CompileTimes:
                 compilation_cache.reset_cache()
                 jax.clear_caches()
                 population = make_population(env, agents, train, devices=devices)
-                learners = population.init(slots)
+                state = population.init(slots)
                 start = time.perf_counter()
-                population.compile(learners, slots)
+                population.compile(state, slots)
                 seconds.append(round(time.perf_counter() - start, 1))
         finally:
             jax.config.update("jax_compilation_cache_dir", before)
@@ -336,17 +336,15 @@ def _idle(agent: Agent) -> Agent:
 def _program_speed(
     train: TrainConfig, population: Population, slots: tuple[Slot, ...], what: str
 ) -> Speed:
-    learners = population.init(slots)
+    state = population.init(slots)
     start = time.perf_counter()
-    compiled = population.compile(learners, slots)
+    compiled = population.compile(state, slots)
     compile_seconds = time.perf_counter() - start
     best = float("inf")
     for chunk in range(REPEATS + 1):  # the first warms up
         start = time.perf_counter()
-        learners, metrics = population.chunk(
-            learners, slots, chunk * train.chunk_epochs
-        )
-        jax.block_until_ready((learners, metrics))
+        state, metrics = population.chunk(state, slots, chunk * train.chunk_epochs)
+        jax.block_until_ready((state, metrics))
         if chunk:
             best = min(best, time.perf_counter() - start)
     num_slots = sum(group.key.shape[0] for group in slots)

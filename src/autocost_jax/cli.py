@@ -213,8 +213,8 @@ def _evaluate(argv: list[str]) -> None:
 
     config = run_config(options.run)
     files = policy_files(options.run, options.policies)
-    agent, states = load_policies(config.train, files)
     env = make_env(config.train.env)
+    agent, states = load_policies(env, config.train, files)
     run = make_evaluator(env, agent, options.episodes, options.deterministic)
     key = jax.random.fold_in(jax.random.key(options.seed), EVALUATION)
     results, _ = run(states, key)

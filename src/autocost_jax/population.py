@@ -25,12 +25,12 @@ from autocost_jax.evaluate import Episodes, run_episodes, score
 from autocost_jax.files import is_key
 from autocost_jax.records import EvalResult, Key, Metrics, Slot, TrainingCost
 from autocost_jax.train import (
-    Learner,
+    EpochState,
     final_episodes,
     init_learner,
     require_length,
     run_epoch,
-    start_cohorts,
+    start_epochs,
 )
 
 AXIS = "slot"
@@ -43,21 +43,21 @@ class Population(NamedTuple):
     """The compiled face of a population.
 
     Attributes:
-      init: slots -> learners; both one stacked pytree [P_g, ...] a group.
-      final: (learners, slots) -> what trained agents do in whole fresh episodes,
-        metrics [rounds, P_g] a group.
-      chunk: (learners, slots, epoch) -> (learners, metrics [K, P_g] a group); the
-        learners passed in are donated.
-      compile: (learners, slots) -> the program of `chunk` for these shapes, compiled
+      init: slots, one stacked pytree [P_g, ...] a group -> state before any epoch.
+      final: (state, slots) -> what trained agents do in whole fresh episodes, metrics
+        [rounds, P_g] a group.
+      chunk: (state, slots, epoch) -> (state, metrics [K, P_g] a group); the state
+        passed in is donated.
+      compile: (state, slots) -> the program of `chunk` for these shapes, compiled
         ahead of its first call; `chunk` compiles any other shapes when they come.
       fetch: stacked pytree -> the same in the memory of every process.
       num_devices: devices it runs on.
     """
 
-    init: Callable[[tuple[Slot, ...]], tuple[Learner, ...]]
-    final: Callable[..., tuple[Metrics, ...]]
-    chunk: Callable[..., tuple[tuple[Learner, ...], tuple[Metrics, ...]]]
-    compile: Callable[[tuple[Learner, ...], tuple[Slot, ...]], Any]
+    init: Callable[[tuple[Slot, ...]], EpochState]
+    final: Callable[[EpochState, tuple[Slot, ...]], tuple[Metrics, ...]]
+    chunk: Callable[..., tuple[EpochState, tuple[Metrics, ...]]]
+    compile: Callable[[EpochState, tuple[Slot, ...]], Any]
     fetch: Callable[[Any], Any]
     num_devices: int
 
@@ -125,8 +125,8 @@ def make_population(
     )
     final_fn = jax.jit(
         jax.shard_map(
-            lambda learners, slots: final_episodes(
-                env, agents, config, learners, slots, final_rounds
+            lambda state, slots: final_episodes(
+                env, agents, config, state.learners, slots, final_rounds
             ),
             mesh=mesh,
             in_specs=P(AXIS),
@@ -136,23 +136,23 @@ def make_population(
     )
     compiled: dict[Any, Any] = {}  # by the shapes that it is for
 
-    def init(slots: tuple[Slot, ...]) -> tuple[Learner, ...]:
+    def init(slots: tuple[Slot, ...]) -> EpochState:
         return _unpad(init_fn(_pad(slots, mesh)), _sizes(slots))
 
-    def compile_(learners: tuple[Learner, ...], slots: tuple[Slot, ...]):
-        inputs = (_pad(learners, mesh), _pad(slots, mesh))
+    def compile_(state: EpochState, slots: tuple[Slot, ...]):
+        inputs = _pad((state, slots), mesh)
         program = chunk_fn.lower(*inputs, jnp.zeros((), jnp.int32)).compile()
         compiled[_shapes(inputs)] = program
         return program
 
-    def chunk(learners: tuple[Learner, ...], slots: tuple[Slot, ...], epoch: int):
-        inputs, sizes = (_pad(learners, mesh), _pad(slots, mesh)), _sizes(slots)
+    def chunk(state: EpochState, slots: tuple[Slot, ...], epoch: int):
+        inputs, sizes = _pad((state, slots), mesh), _sizes(slots)
         run = compiled.get(_shapes(inputs), chunk_fn)
-        learners, metrics = run(*inputs, jnp.asarray(epoch, jnp.int32))
-        return _unpad(learners, sizes), _unpad_metrics(metrics, sizes)
+        state, metrics = run(*inputs, jnp.asarray(epoch, jnp.int32))
+        return _unpad(state, sizes), _unpad_metrics(metrics, sizes)
 
-    def final(learners: tuple[Learner, ...], slots: tuple[Slot, ...]):
-        metrics = final_fn(_pad(learners, mesh), _pad(slots, mesh))
+    def final(state: EpochState, slots: tuple[Slot, ...]):
+        metrics = final_fn(*_pad((state, slots), mesh))
         return _unpad_metrics(metrics, _sizes(slots))
 
     return Population(
@@ -188,12 +188,12 @@ def make_evaluator(
 
 def _init(
     env: Env, agents: tuple[Agent, ...], config: TrainConfig, slots: tuple[Slot, ...]
-) -> tuple[Learner, ...]:
+) -> EpochState:
     learners = tuple(
         jax.vmap(lambda slot, agent=agent: init_learner(agent, slot))(group)
         for agent, group in zip(agents, slots, strict=True)
     )
-    return start_cohorts(env, agents, config, learners, slots)
+    return start_epochs(env, agents, config, learners, slots)
 
 
 def _chunk_fn(
@@ -203,13 +203,12 @@ def _chunk_fn(
     bank: tuple[CostTerm, ...],
     mesh: Mesh,
 ):
-    def chunk(learners: tuple[Learner, ...], slots: tuple[Slot, ...], epoch: jax.Array):
-        def body(learners: tuple[Learner, ...], epoch: jax.Array):
-            return run_epoch(env, agents, config, learners, slots, epoch, bank)
+    def chunk(state: EpochState, slots: tuple[Slot, ...], epoch: jax.Array):
+        def body(state: EpochState, epoch: jax.Array):
+            return run_epoch(env, agents, config, state, slots, epoch, bank)
 
-        learners = remake_empty(learners)
         epochs = epoch + jnp.arange(config.chunk_epochs, dtype=jnp.int32)
-        return jax.lax.scan(body, learners, epochs)
+        return jax.lax.scan(body, remake_empty(state), epochs)
 
     sharded = jax.shard_map(
         chunk,
@@ -244,7 +243,7 @@ def _shapes(tree: Any) -> Any:
     return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
 
 
-def _pad(groups: tuple[Any, ...], mesh: Mesh) -> tuple[Any, ...]:
+def _pad(tree: Any, mesh: Mesh) -> Any:
     """Each group filled up with copies of its first slot, laid over the devices."""
     split = NamedSharding(mesh, P(AXIS))
 
@@ -262,7 +261,7 @@ def _pad(groups: tuple[Any, ...], mesh: Mesh) -> tuple[Any, ...]:
             value.shape, split, lambda index: value[index]
         )
 
-    return tuple(jax.tree.map(pad, group) for group in groups)
+    return jax.tree.map(pad, tree)
 
 
 def _fill(leaf: jax.Array, multiple: int) -> jax.Array:
@@ -278,13 +277,15 @@ def _same(tree: Any) -> Any:
     return tree
 
 
-def _unpad(groups: tuple[Any, ...], sizes: list[int]) -> tuple[Any, ...]:
-    return tuple(
-        jax.tree.map(
-            lambda leaf, size=size: leaf[:size] if leaf.shape[0] > size else leaf, group
+def _unpad(state: EpochState, sizes: list[int]) -> EpochState:
+    def cut(groups: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(
+            jax.tree.map(lambda x, size=size: x[:size] if len(x) > size else x, group)
+            for group, size in zip(groups, sizes, strict=True)
         )
-        for group, size in zip(groups, sizes, strict=True)
-    )
+
+    worlds = None if state.worlds is None else cut(state.worlds)
+    return EpochState(cut(state.learners), worlds)
 
 
 def _fetch(tree: Any, mesh: Mesh) -> Any:

@@ -37,13 +37,24 @@ class Learner(struct.PyTreeNode):
       frozen: [] bool; True once anything of it was non-finite. `agent` is then the
         last finite state.
       frozen_epoch: [] int32 epoch in which that happened, else -1.
-      worlds: [(k - 1) N, ...] its older cohorts; None for one segment per episode.
     """
 
     agent: Any
     frozen: jax.Array
     frozen_epoch: jax.Array
-    worlds: EnvState | None = None
+
+
+class EpochState(struct.PyTreeNode):
+    """What one epoch of a population hands to the next.
+
+    Attributes:
+      learners: for each group, stacked [P_g, ...].
+      worlds: for each group its slots' older cohorts [P_g, (k - 1) N, ...]; None for
+        one segment per episode.
+    """
+
+    learners: tuple[Learner, ...]
+    worlds: tuple[EnvState, ...] | None = None
 
 
 def slot_key(slot: Slot, epoch: jax.Array | int, purpose: int) -> Key:
@@ -82,30 +93,29 @@ def run_epoch(
     env: Env,
     agents: Sequence[Agent],
     config: TrainConfig,
-    learners: tuple[Learner, ...],
+    state: EpochState,
     slots: tuple[Slot, ...],
     epoch: jax.Array,
     bank: Sequence[CostTerm] = BANK,
-) -> tuple[tuple[Learner, ...], tuple[Metrics, ...]]:
+) -> tuple[EpochState, tuple[Metrics, ...]]:
     """One epoch of every slot of every group.
 
     Args:
       env: the environment all slots share.
       agents: one algorithm for each group.
       config: sizes of the epoch.
-      learners: for each group, stacked [P_g, ...]; for k > 1 from `start_cohorts`.
+      state: from `start_epochs` or the epoch before.
       slots: for each group, stacked [P_g, ...].
       epoch: [] int32, counted from the start of the stage.
       bank: the cost terms, static.
 
     Returns:
-      Learners, and for each group metrics [P_g].
+      The next state, and for each group metrics [P_g].
     """
-    worlds, seen = _rollout(env, agents, config, learners, slots, epoch)
-    learners = _carry(config, learners, slots, worlds)
-    after, metrics = [], []
+    worlds, seen = _rollout(env, agents, config, state, slots, epoch)
+    learners, metrics = [], []
     for agent, learner, slot, (trajectory, counts) in zip(
-        agents, learners, slots, seen, strict=True
+        agents, state.learners, slots, seen, strict=True
     ):
 
         def update(learner: Learner, slot: Slot, trajectory, counts, agent=agent):
@@ -113,43 +123,43 @@ def run_epoch(
                 env, agent, config, learner, slot, trajectory, counts, epoch, bank
             )
 
-        inputs = (learner.replace(worlds=None), slot, trajectory, counts)
+        inputs = (learner, slot, trajectory, counts)
         learned, group_metrics = _map_slots(config, update, inputs)
-        after.append(learned.replace(worlds=learner.worlds))
+        learners.append(learned)
         metrics.append(group_metrics)
-    return tuple(after), tuple(metrics)
+    carried = _carry(config, slots, worlds)
+    return EpochState(tuple(learners), carried), tuple(metrics)
 
 
-def start_cohorts(
+def start_epochs(
     env: Env,
     agents: Sequence[Agent],
     config: TrainConfig,
     learners: tuple[Learner, ...],
     slots: tuple[Slot, ...],
-) -> tuple[Learner, ...]:
-    """Learners with the cohorts that a stage starts with; as they are for k = 1.
+) -> EpochState:
+    """The state before the first epoch: learners, and the cohorts that a stage has.
 
     Cohort j has stepped j / k of an episode with the initial policies; what they saw
-    is discarded.
+    is discarded. With one segment per episode there is none.
     """
     segments = config.segments_per_episode
     if segments == 1:
-        return learners
+        return EpochState(learners)
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *slots)
     num_carried = config.num_worlds * (segments - 1)
     before = jnp.asarray(-segments, jnp.int32)  # no other epoch has this number
     worlds = jax.vmap(
         lambda slot: reset_worlds(env, slot_key(slot, before, RESET), num_carried)
     )(joined)
-    learners = _carry(config, learners, slots, worlds)
+    first = EpochState(learners, _carry(config, slots, worlds))
 
-    def warm_up(learners: tuple[Learner, ...], segment: jax.Array):
+    def warm_up(state: EpochState, segment: jax.Array):
         # Negative epochs: their keys are not those of any training epoch.
-        worlds, _ = _rollout(env, agents, config, learners, slots, -1 - segment)
-        return _carry(config, learners, slots, worlds), None
+        worlds, _ = _rollout(env, agents, config, state, slots, -1 - segment)
+        return EpochState(learners, _carry(config, slots, worlds)), None
 
-    learners, _ = jax.lax.scan(warm_up, learners, jnp.arange(segments - 1))
-    return learners
+    return jax.lax.scan(warm_up, first, jnp.arange(segments - 1))[0]
 
 
 def final_episodes(
@@ -174,11 +184,11 @@ def final_episodes(
         num_worlds=config.num_worlds * config.segments_per_episode,
         segments_per_episode=1,
     )
-    fresh = tuple(learner.replace(worlds=None) for learner in learners)
+    state = EpochState(learners)
 
     def play(carry: None, index: jax.Array):
         epoch = config.num_epochs + index  # no epoch has this number
-        _, seen = _rollout(env, agents, whole, fresh, slots, epoch)
+        _, seen = _rollout(env, agents, whole, state, slots, epoch)
 
         def one(slot: Slot, trajectory: Trajectory, counts: Metrics) -> Metrics:
             cost = trajectory.cost_inputs.cost
@@ -236,26 +246,23 @@ def run_stage(
       Learners and for each group metrics [num_epochs, P_g].
     """
 
-    def body(learners: tuple[Learner, ...], epoch: jax.Array):
-        return run_epoch(env, agents, config, learners, slots, epoch, bank)
+    def body(state: EpochState, epoch: jax.Array):
+        return run_epoch(env, agents, config, state, slots, epoch, bank)
 
-    learners = start_cohorts(env, agents, config, learners, slots)
+    state = start_epochs(env, agents, config, learners, slots)
     epochs = jnp.arange(config.num_epochs, dtype=jnp.int32)
-    return jax.lax.scan(body, learners, epochs)
+    state, metrics = jax.lax.scan(body, state, epochs)
+    return state.learners, metrics
 
 
 def _carry(
-    config: TrainConfig,
-    learners: tuple[Learner, ...],
-    slots: tuple[Slot, ...],
-    worlds: EnvState,
-) -> tuple[Learner, ...]:
-    """Learners that take all cohorts but the oldest of [sum P_g, k N] worlds along."""
+    config: TrainConfig, slots: tuple[Slot, ...], worlds: EnvState
+) -> tuple[EnvState, ...] | None:
+    """Of [sum P_g, k N] worlds all cohorts but the oldest, a group each."""
     kept = carry_cohorts(worlds, config.num_worlds, config.segments_per_episode, 1)
-    return tuple(
-        learner.replace(worlds=jax.tree.map(lambda x, part=part: x[part], kept))
-        for learner, part in zip(learners, _parts(slots), strict=True)
-    )
+    if kept is None:
+        return None
+    return tuple(jax.tree.map(lambda x, p=p: x[p], kept) for p in _parts(slots))
 
 
 def population_chunk(config: TrainConfig, num_slots: int) -> int:
@@ -292,7 +299,7 @@ def _rollout(
     env: Env,
     agents: Sequence[Agent],
     config: TrainConfig,
-    learners: tuple[Learner, ...],
+    state: EpochState,
     slots: tuple[Slot, ...],
     epoch: jax.Array,
 ) -> tuple[EnvState, list[tuple[Trajectory, Metrics]]]:
@@ -309,17 +316,16 @@ def _rollout(
     fresh = jax.vmap(lambda key: reset_worlds(env, key, config.num_worlds))(
         jnp.concatenate(keys(RESET))
     )
-    carried = [learner.worlds for learner in learners]
     older = None
-    if carried[0] is not None:
-        older = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *carried)
+    if state.worlds is not None:
+        older = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *state.worlds)
     start = join_cohorts(fresh, older, 1)
     act_keys, parts = keys(ACT), _parts(slots)
 
     def act(obs: jax.Array, t: jax.Array) -> jax.Array:
         actions = []
         for agent, learner, key, part in zip(
-            agents, learners, act_keys, parts, strict=True
+            agents, state.learners, act_keys, parts, strict=True
         ):
             actions.append(
                 jax.vmap(

@@ -8,9 +8,9 @@ import numpy as np
 from autocost_jax import es as es_lib
 from autocost_jax.agents.base import Actor, actor
 from autocost_jax.config import SearchConfig
+from autocost_jax.envs.env import Env
 from autocost_jax.es import Fitness
 from autocost_jax.files import flatten
-from autocost_jax.records import Key
 from autocost_jax.runs.directory import RunDir
 from autocost_jax.runs.outcome import (
     BEST,
@@ -27,12 +27,12 @@ from autocost_jax.runs.outcome import (
 )
 from autocost_jax.runs.policies import EVALUATION, load_policies, policy_name
 from autocost_jax.runs.progress import Display
-from autocost_jax.search.evolution import SearchState, best_of, pick_label
+from autocost_jax.search.evolution import Searcher, SearchState, best_of, pick_label
 
 
 def finish(
     run: RunDir,
-    root: Key,
+    searcher: Searcher,
     state: SearchState,
     display: Display,
     num_episodes: int,
@@ -41,8 +41,8 @@ def finish(
 
     Args:
       run: the run directory.
-      root: the root key of the search.
-      state: of a search that is over, its learners in this process's memory.
+      searcher: of the search.
+      state: of a search that is over, its training in this process's memory.
       display: that says so.
       num_episodes: of each agent.
 
@@ -57,19 +57,21 @@ def finish(
         config.zero_tolerance,
         config.pool_scores,
     )
+    learners = state.training.learners
     chosen, finalists = 0, []
     if config.num_finalists:
-        last = last_scores(config, state.history, state.learners)
+        last = last_scores(config, state.history, learners)
         chosen = pick(config, *last)
         finalists = finalist_rows(config, np.asarray(order), *last)
-        actors, num_seeds = final_actors(config, state.learners, chosen)
+        actors, num_seeds = final_actors(config, learners, chosen)
     best = int(order[chosen])
     if not config.num_finalists:
-        actors, num_seeds = _left_by_its_stage(run, best), 1
-    key = jax.random.fold_in(root, EVALUATION)
+        actors, num_seeds = _left_by_its_stage(run, searcher.env, best), 1
+    key = jax.random.fold_in(searcher.root, EVALUATION)
     what = f"evaluating over {num_episodes} fresh episodes an agent"
+    sizes = (num_seeds, key, num_episodes)
     with display.working(what) as tell:
-        scores = score_agents(config.train, actors, num_seeds, key, num_episodes, tell)
+        scores = score_agents(searcher.env, config.train, actors, *sizes, tell)
     rows = summary_rows(config, scores, num_episodes)
     for cost, place in compared(config).items():
         for a, name in enumerate(config.algorithms):
@@ -117,12 +119,12 @@ def _card(
     }
 
 
-def _left_by_its_stage(run: RunDir, place: int) -> list[Actor]:
+def _left_by_its_stage(run: RunDir, env: Env, place: int) -> list[Actor]:
     """For each algorithm the agent [1, ...] of a candidate that its stage has kept."""
     stage = place // run.config.population_size
     files = [
         run.path / "policies" / f"{policy_name(stage, name)}.npz"
         for name in run.config.algorithms
     ]
-    loaded = (load_policies(run.config.train, [file])[1] for file in files)
+    loaded = (load_policies(env, run.config.train, [file])[1] for file in files)
     return [actor(state) for state in loaded]

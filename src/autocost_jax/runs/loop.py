@@ -25,7 +25,7 @@ class Chunk(NamedTuple):
     """What a chunk of epochs has left.
 
     Attributes:
-      state: what a checkpoint holds; its `learners` are the device's.
+      state: what a checkpoint holds; its `training` is on the devices.
       first: number of the chunk's first epoch in the run.
       rows: of metrics.jsonl, one an epoch.
       position: facts of the checkpoint, see `RunDir.save_checkpoint`.
@@ -99,10 +99,10 @@ def keep_chunks(
       run: the open run directory.
       chunks: made as they are asked for.
       state: before the first one.
-      fetch: learners -> the same in this process's memory.
+      fetch: pytree -> the same in this process's memory.
 
     Returns:
-      The last state, its learners fetched.
+      The last state, its training fetched.
     """
     saved_at = -np.inf  # the first chunk is kept, whatever comes
     for chunk in chunks:
@@ -112,12 +112,12 @@ def keep_chunks(
                 run.log_metrics(row, chunk.first + k)
         is_due = chunk.is_end or time.monotonic() - saved_at >= CHECKPOINT_SECONDS
         if is_due or jax.process_count() > 1:  # clocks differ, and all must take part
-            saved = state.replace(learners=fetch(state.learners))
+            saved = state.replace(training=fetch(state.training))
             if run is not None:
                 after = chunk.first + len(chunk.rows)
                 run.save_checkpoint(saved, after, chunk.position)
             saved_at = time.monotonic()
-    return state.replace(learners=fetch(state.learners))
+    return state.replace(training=fetch(state.training))
 
 
 def useful_devices(

@@ -13,7 +13,7 @@ import numpy as np
 
 from autocost_jax.agents.base import Actor, actor
 from autocost_jax.config import SearchConfig, TrainConfig
-from autocost_jax.envs.env import make_env
+from autocost_jax.envs.env import Env
 from autocost_jax.evaluate import Recording, first_recording, watch_first
 from autocost_jax.population import make_evaluator
 from autocost_jax.records import EvalResult, Key, Metrics
@@ -52,6 +52,7 @@ class Scores(NamedTuple):
 
 
 def score_agents(
+    env: Env,
     train: TrainConfig,
     actors: Sequence[Actor],
     num_seeds: int,
@@ -62,6 +63,7 @@ def score_agents(
     """Agents of several costs and seeds over fresh episodes, with sampled actions.
 
     Args:
+      env: where they act.
       train: the run's training configuration.
       actors: for each algorithm, stacked [C x S, ...], the seeds of a cost in a row.
       num_seeds: S.
@@ -69,7 +71,6 @@ def score_agents(
       num_episodes: E, of each agent.
       tell: (done, all) -> None, called after each part.
     """
-    env = make_env(train.env)
     num_costs = jax.tree.leaves(actors[0])[0].shape[0] // num_seeds
     parts = [(a, s) for a in range(len(actors)) for s in range(num_seeds)]
     values: dict[tuple[int, int], EvalResult] = {}
@@ -78,7 +79,7 @@ def score_agents(
     for done, (a, s) in enumerate(parts, 1):
         slots = np.arange(num_costs) * num_seeds + s
         acting = jax.tree.map(lambda x, at=slots: x[at], actors[a])
-        agent, states = policy_states(train, acting)
+        agent, states = policy_states(env, train, acting)
         if evaluator is None:
             evaluator = make_evaluator(env, agent, num_episodes, watch=watch_first)
         result, episodes = evaluator(states, key)

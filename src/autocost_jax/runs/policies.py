@@ -11,7 +11,7 @@ import numpy as np
 
 from autocost_jax.agents.base import Actor, Agent, actor
 from autocost_jax.config import TrainConfig
-from autocost_jax.envs.env import Env, make_env
+from autocost_jax.envs.env import Env
 from autocost_jax.files import RunDirError, load_arrays, unflatten
 from autocost_jax.population import make_agents
 from autocost_jax.records import EvalResult, Key
@@ -30,10 +30,13 @@ def policy_name(stage: int, algorithm: str) -> str:
     return f"stage_{stage:02d}_{algorithm}"
 
 
-def load_policies(train: TrainConfig, files: Sequence[Path]) -> tuple[Agent, Any]:
+def load_policies(
+    env: Env, train: TrainConfig, files: Sequence[Path]
+) -> tuple[Agent, Any]:
     """Saved policies as one stacked agent state, and the agent that acts for it.
 
     Args:
+      env: where they act.
       train: the run's training configuration, for the shapes.
       files: policies/*.npz.
 
@@ -43,14 +46,14 @@ def load_policies(train: TrainConfig, files: Sequence[Path]) -> tuple[Agent, Any
     Raises:
       RunDirError: a file is missing or is not such a policy.
     """
-    part = actor(_acting_agent(train).init(jax.random.key(0)))
+    part = actor(_acting_agent(env, train).init(jax.random.key(0)))
     loaded = [unflatten(load_arrays(file, None), part) for file in files]
-    return policy_states(train, jax.tree.map(lambda *x: jnp.stack(x), *loaded))
+    return policy_states(env, train, jax.tree.map(lambda *x: jnp.stack(x), *loaded))
 
 
-def policy_states(train: TrainConfig, actors: Actor) -> tuple[Agent, Any]:
+def policy_states(env: Env, train: TrainConfig, actors: Actor) -> tuple[Agent, Any]:
     """Actors [P, ...] as one stacked agent state, and the agent that acts for it."""
-    agent = _acting_agent(train)
+    agent = _acting_agent(env, train)
     size = jax.tree.leaves(actors)[0].shape[0]
     stacked = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf, (size, *leaf.shape)),
@@ -59,9 +62,9 @@ def policy_states(train: TrainConfig, actors: Actor) -> tuple[Agent, Any]:
     return agent, dataclasses.replace(stacked, **actors._asdict())
 
 
-def _acting_agent(train: TrainConfig) -> Agent:
+def _acting_agent(env: Env, train: TrainConfig) -> Agent:
     """Whose policy it is does not matter: all agents act alike."""
-    return make_agents(("ppo_lagrangian",), train, make_env(train.env))[0]
+    return make_agents(("ppo_lagrangian",), train, env)[0]
 
 
 def policy_files(path: Path, names: Sequence[str] = ()) -> list[Path]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from autocost_jax.agents.base import actor
 from autocost_jax.config import SearchConfig
-from autocost_jax.envs.env import make_env
+from autocost_jax.envs.env import Env
 from autocost_jax.files import flatten
 from autocost_jax.runs import cluster
 from autocost_jax.runs.directory import RunDir, open_run
@@ -50,13 +50,12 @@ from autocost_jax.search.stages import StageResult
 from autocost_jax.train import population_chunk
 
 
-def estimate_memory(config: SearchConfig, num_devices: int) -> int:
+def estimate_memory(config: SearchConfig, env: Env, num_devices: int) -> int:
     """Bytes the largest arrays of the program need on each device, roughly.
 
     The trajectory of all slots, twice (the rollout writes it time-first, the updates
     read it slot-first), and four copies of parameters and optimiser moments.
     """
-    env = make_env(config.train.env)
     slots = config.slots_per_algorithm * len(config.algorithms)
     row = env.observation_size + 2 * env.action_size + 24
     rows = config.train.num_worlds * env.episode_length
@@ -67,13 +66,14 @@ def estimate_memory(config: SearchConfig, num_devices: int) -> int:
     activations = 4 * batch * width * len(config.train.agent.hidden_sizes)
     per_slot = 2 * row * rows + 4 * 3 * 3 * weights
     here = -(-slots // num_devices)
-    at_once = population_chunk(config.train, -(-config.slots_per_algorithm // num_devices))
+    at_once = population_chunk(
+        config.train, -(-config.slots_per_algorithm // num_devices)
+    )
     return 4 * (per_slot * here + activations * at_once)
 
 
-def estimate_disk(config: SearchConfig) -> int:
+def estimate_disk(config: SearchConfig, env: Env) -> int:
     """Bytes of four checkpoints (three are kept), which hold nearly all of a run."""
-    env = make_env(config.train.env)
     hidden = config.train.agent.hidden_sizes
     networks = [(env.observation_size, *hidden, out) for out in (env.action_size, 1, 1)]
     weights = sum(
@@ -83,7 +83,7 @@ def estimate_disk(config: SearchConfig) -> int:
     return 4 * 4 * 3 * weights * slots  # float32 parameters and two Adam moments
 
 
-def describe(config: SearchConfig, num_devices: int) -> list[str]:
+def describe(config: SearchConfig, env: Env, num_devices: int) -> list[str]:
     """What a run will do, as lines for people."""
     train, agent = config.train, config.train.agent
     algorithms = " + ".join(config.algorithms)
@@ -91,6 +91,7 @@ def describe(config: SearchConfig, num_devices: int) -> list[str]:
     if train.segments_per_episode > 1:
         worlds += f" in {train.segments_per_episode} cohorts"
     sizes = "-".join(str(size) for size in agent.hidden_sizes)
+    memory = estimate_memory(config, env, num_devices) / 1e9
     beside = ", beside the extrinsic cost alone and a margin of 3x"
     lines = [
         f"{train.env.name}: {config.num_stages} stages of {config.population_size} "
@@ -100,9 +101,8 @@ def describe(config: SearchConfig, num_devices: int) -> list[str]:
         f"{agent.policy_passes} x {agent.policy_minibatches} and critic "
         f"{agent.value_passes} x {agent.value_minibatches} steps an epoch",
         f"{config.env_steps:,} env steps in all; on {num_devices} device(s) of kind "
-        f"{jax.devices()[0].device_kind}; about "
-        f"{estimate_memory(config, num_devices) / 1e9:.2f} GB of memory on each and "
-        f"{estimate_disk(config) / 1e6:.0f} MB of disk; the time left is shown as "
+        f"{jax.devices()[0].device_kind}; about {memory:.2f} GB of memory on each and "
+        f"{estimate_disk(config, env) / 1e6:.0f} MB of disk; the time left is shown as "
         "soon as the first epoch is done",
     ]
     if config.num_finalists:
@@ -114,7 +114,7 @@ def describe(config: SearchConfig, num_devices: int) -> list[str]:
     return lines
 
 
-def check_memory(config: SearchConfig, devices: Sequence[Any]) -> None:
+def check_memory(config: SearchConfig, env: Env, devices: Sequence[Any]) -> None:
     """Refuse a run whose arrays cannot fit on its devices.
 
     Raises:
@@ -125,7 +125,7 @@ def check_memory(config: SearchConfig, devices: Sequence[Any]) -> None:
     if devices[0].platform == "cpu":  # its devices share the machine's memory
         machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         limit = machine // len(jax.local_devices())
-    need = estimate_memory(config, len(devices))
+    need = estimate_memory(config, env, len(devices))
     if limit is not None and need > limit:
         raise ValueError(
             f"the run needs about {need / 1e9:.1f} GB on each device, which has "
@@ -166,12 +166,12 @@ def run_search(
     """
     require_episodes(num_episodes)
     devices = useful_devices(devices, config.slots_per_algorithm, "slots")
-    check_memory(config, devices)
     searcher = make_searcher(config, devices)
+    check_memory(config, searcher.env, devices)
     opened = open_run(path, config, resume=resume, overwrite=overwrite)
     with opened as run, Display(config.env_steps, 0, output(), planned) as display:
         warnings = run.warnings if run else []
-        for line in [*warnings, *describe(config, len(devices))]:
+        for line in [*warnings, *describe(config, searcher.env, len(devices))]:
             display.say(line)
         state, resumed = start(run, path, init_search(searcher), display, resume)
         if resumed:
@@ -184,7 +184,7 @@ def run_search(
         chunks = _chunks(run, searcher, state, display)
         state = keep_chunks(run, chunks, state, searcher.population.fetch)
         if run is not None:
-            finish(run, searcher.root, state, display, num_episodes)
+            finish(run, searcher, state, display, num_episodes)
             page = write_report(path) if write_report else path
             display.say(f"done in {format_seconds(display.elapsed)}; open {page}")
         cluster.wait_for_all()
@@ -194,7 +194,7 @@ def _compile(searcher: Searcher, state: SearchState, display: Display) -> None:
     start = time.monotonic()
     slots = slots_of(searcher, state)
     with display.working("compiling the population program"):
-        searcher.population.compile(state.learners, slots)
+        searcher.population.compile(state.training, slots)
     display.say(f"compiled in {time.monotonic() - start:.1f} s")
 
 

@@ -19,7 +19,7 @@ from flax import struct
 from autocost_jax.agents.base import actor
 from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import parse_cost, training_cost
-from autocost_jax.envs.env import make_env
+from autocost_jax.envs.env import Env, make_env
 from autocost_jax.files import flatten
 from autocost_jax.population import (
     Population,
@@ -47,7 +47,7 @@ from autocost_jax.runs.policies import (
     score_line,
 )
 from autocost_jax.runs.progress import Display, format_seconds
-from autocost_jax.train import Learner
+from autocost_jax.train import EpochState
 
 AlgorithmName = Literal["ppo", "ppo_lagrangian", "cpo"]
 # PPO is a PPO-Lagrangian slot that ignores cost.
@@ -134,11 +134,11 @@ class SweepState(struct.PyTreeNode):
     """What a checkpoint holds.
 
     Attributes:
-      learners: for each group, stacked [P, ...].
+      training: of each group's slots [P].
       epoch: [] int32 epochs done.
     """
 
-    learners: tuple[Learner, ...]
+    training: EpochState
     epoch: jax.Array
 
 
@@ -212,7 +212,7 @@ def run_sweep(
         state = keep_chunks(run, chunks, state, population.fetch)
         table = []
         if run is not None:
-            table = _finish(run, config, state, display, num_episodes)
+            table = _finish(run, env, config, state, display, num_episodes)
         cluster.wait_for_all()
         return table
 
@@ -227,10 +227,10 @@ def _chunks(
     """Train chunk after chunk, and show each."""
     chunk, total = config.train.chunk_epochs, config.train.num_epochs
     begun, first = time.monotonic(), int(state.epoch)
-    learners = state.learners
+    training = state.training
     for epoch in range(first, total, chunk):
         after = epoch + chunk
-        learners, metrics = population.chunk(learners, slots, epoch)
+        training, metrics = population.chunk(training, slots, epoch)
         metrics = jax.tree.map(np.asarray, population.fetch(metrics))
         left = (time.monotonic() - begun) / (after - first) * (total - after)
         named = zip(config.algorithms, metrics, strict=True)
@@ -241,7 +241,7 @@ def _chunks(
         )
         rows = metric_rows(config.algorithms, metrics)
         yield Chunk(
-            state=SweepState(learners, jnp.asarray(after, jnp.int32)),
+            state=SweepState(training, jnp.asarray(after, jnp.int32)),
             first=epoch,
             rows=[row | {"epoch": epoch + k} for k, row in enumerate(rows)],
             position={},
@@ -263,6 +263,7 @@ def _line(config: SweepConfig, name: str, metrics: dict[str, np.ndarray]) -> str
 
 def _finish(
     run: RunDir,
+    env: Env,
     config: SweepConfig,
     state: SweepState,
     display: Display,
@@ -270,22 +271,22 @@ def _finish(
 ) -> list[dict[str, Any]]:
     """Save every policy, score it over fresh episodes, write evaluation.json."""
     files, table = [], []
+    learners = state.training.learners
     for i, name in enumerate(config.algorithms):
         for index, (method, seed) in enumerate(config.group(name)):
             params = jax.tree.map(
                 lambda leaf, i=i, index=index: leaf[index],
-                actor(state.learners[i].agent),
+                actor(learners[i].agent),
             )
             stem = f"{method.label}_seed{seed}"
             files.append(run.write_policy(stem, flatten(params)))
-            frozen = int(state.learners[i].frozen_epoch[index])
+            frozen = int(learners[i].frozen_epoch[index])
             row = {"method": method.label, "seed": seed, "frozen_epoch": frozen}
             table.append(row)
             if frozen >= 0:
                 display.say(f"{stem} met a non-finite number in epoch {frozen}")
     display.say(f"evaluating {len(files)} policies over {num_episodes} episodes ...")
-    agent, states = load_policies(config.train, files)
-    env = make_env(config.train.env)
+    agent, states = load_policies(env, config.train, files)
     key = jax.random.key(EVALUATION)
     results, _ = make_evaluator(env, agent, num_episodes)(states, key)
     for i, row in enumerate(table):

@@ -17,7 +17,7 @@ from flax import struct
 from autocost_jax import es as es_lib
 from autocost_jax.config import SearchConfig
 from autocost_jax.costs import BANK, CostTerm
-from autocost_jax.envs.env import make_env
+from autocost_jax.envs.env import Env, make_env
 from autocost_jax.es import ESState, Fitness
 from autocost_jax.population import (
     Population,
@@ -33,7 +33,13 @@ from autocost_jax.search.stages import (
     deal,
     stage_functions,
 )
-from autocost_jax.train import Learner, final_episodes, init_learner, run_stage
+from autocost_jax.train import (
+    EpochState,
+    Learner,
+    final_episodes,
+    init_learner,
+    run_stage,
+)
 
 
 class SearchState(struct.PyTreeNode):
@@ -43,7 +49,7 @@ class SearchState(struct.PyTreeNode):
       es: the evolutionary strategy's state.
       candidates: [P, D] the candidates in training; in the finalists' stage the best of
         the search, of which the first are trained.
-      learners: for each algorithm, stacked [N, ...], slots as `stages.deal` has them.
+      training: of each algorithm's slots [N], as `stages.deal` has them.
       stage: [] int32; `num_stages` is that of the finalists, and
         `SearchConfig.total_stages` says that the search is over.
       epoch: [] int32, epochs of this stage already done.
@@ -52,7 +58,7 @@ class SearchState(struct.PyTreeNode):
 
     es: ESState
     candidates: jax.Array
-    learners: tuple[Learner, ...]
+    training: EpochState
     stage: jax.Array
     epoch: jax.Array
     history: Metrics
@@ -104,12 +110,14 @@ class Searcher(NamedTuple):
 
     Attributes:
       config: the search.
+      env: its environment.
       root: its root key.
       population: the population program.
       stage: the functions around it, jitted.
     """
 
     config: SearchConfig
+    env: Env
     root: Key
     population: Population
     stage: StageFunctions
@@ -123,7 +131,7 @@ def search(
     agents = make_agents(config.algorithms, config.train, env)
 
     def run(root: Key) -> SearchResult:
-        functions = stage_functions(config, root, bank)
+        functions = stage_functions(config, env, root, bank)
 
         def train(slots: tuple[Slot, ...], epochs: int) -> tuple[Metrics, jax.Array]:
             """`TRACKED` metrics [E, A, N], and which agents are frozen [A, N]."""
@@ -172,11 +180,12 @@ def make_searcher(
     root = jax.random.key(config.seed)
     return Searcher(
         config=config,
+        env=env,
         root=root,
         population=make_population(
             env, agents, config.train, bank, devices, config.final_rounds
         ),
-        stage=jit_bundle(stage_functions(config, root, bank)),
+        stage=jit_bundle(stage_functions(config, env, root, bank)),
     )
 
 
@@ -195,12 +204,12 @@ def evolve(
 
     Args:
       config: the search.
-      state: where to continue; default: from the start. Its learners are consumed.
+      state: where to continue; default: from the start. Its training is consumed.
       searcher: from `make_searcher(config, ...)`; default: one device.
 
     Yields:
       After each chunk the state, ready to be saved and continued from, and what
-      happened. A yielded state's learners are consumed by the next chunk.
+      happened. A yielded state's training is consumed by the next chunk.
 
     Raises:
       RuntimeError: after a stage, if all its candidates failed; it names the stage.
@@ -227,7 +236,7 @@ def _begin_stage(searcher: Searcher, es_state: ESState, stage: int) -> SearchSta
     return SearchState(
         es=es_state,
         candidates=candidates,
-        learners=searcher.population.init(slots),
+        training=searcher.population.init(slots),
         stage=jnp.asarray(stage, jnp.int32),
         epoch=jnp.zeros((), jnp.int32),
         history={name: jnp.zeros(shape, jnp.float32) for name in TRACKED},
@@ -239,13 +248,13 @@ def _run_chunk(searcher: Searcher, state: SearchState) -> tuple[SearchState, Pro
     config, functions = searcher.config, searcher.stage
     stage, epoch = int(state.stage), int(state.epoch)
     slots = slots_of(searcher, state)
-    learners, metrics = searcher.population.chunk(state.learners, slots, epoch)
+    training, metrics = searcher.population.chunk(state.training, slots, epoch)
     metrics = searcher.population.fetch(metrics)
     history = functions.record(state.history, metrics, epoch)
     after = epoch + config.train.chunk_epochs
     progress = Progress(stage, epoch, jax.tree.map(np.asarray, metrics))
     state = state.replace(
-        learners=learners, history=history, epoch=jnp.asarray(after, jnp.int32)
+        training=training, history=history, epoch=jnp.asarray(after, jnp.int32)
     )
     if after < config.epochs_of(stage):
         return state, progress
@@ -253,18 +262,18 @@ def _run_chunk(searcher: Searcher, state: SearchState) -> tuple[SearchState, Pro
         return _ended(searcher, state), progress
     history = {name: value[:after] for name, value in history.items()}
     fetch = searcher.population.fetch
-    frozen = jnp.stack([fetch(group.frozen) for group in learners])
+    frozen = jnp.stack([fetch(group.frozen) for group in training.learners])
     if config.final_rounds:
-        history = _tracked(fetch(searcher.population.final(learners, slots)))
+        history = _tracked(fetch(searcher.population.final(training, slots)))
     es_state, result = functions.end(state.es, stage, state.candidates, history, frozen)
-    progress = progress._replace(result=result, learners=learners)
+    progress = progress._replace(result=result, learners=training.learners)
     if stage + 1 < config.total_stages and result.fitness.finite.any():
         return _begin_stage(searcher, es_state, stage + 1), progress
     return _ended(searcher, state.replace(es=es_state)), progress
 
 
 def _ended(searcher: Searcher, state: SearchState) -> SearchState:
-    """The state after the last stage; its learners are those of that stage."""
+    """The state after the last stage; its training is that of that stage."""
     over = jnp.asarray(searcher.config.total_stages, jnp.int32)
     return state.replace(stage=over)
 

@@ -16,7 +16,7 @@ from flax import struct
 from autocost_jax import es as es_lib
 from autocost_jax.config import SearchConfig
 from autocost_jax.costs import BANK, CostTerm, training_cost
-from autocost_jax.envs.env import make_env
+from autocost_jax.envs.env import Env
 from autocost_jax.es import ES, ESState, Fitness, truncation_es
 from autocost_jax.records import Key, Metrics, Slot, TrainingCost
 from autocost_jax.rollout import typical_lidars
@@ -248,10 +248,10 @@ def stage_result(
 
 
 def stage_functions(
-    config: SearchConfig, root: Key, bank: Sequence[CostTerm] = BANK
+    config: SearchConfig, env: Env, root: Key, bank: Sequence[CostTerm] = BANK
 ) -> StageFunctions:
     """The functions around the chunks of a search's stages."""
-    strategy = make_strategy(config)
+    strategy = make_strategy(config, env)
 
     def begin(state: ESState, stage: jax.Array | int):
         candidates = strategy.ask(stage_key(root, stage, ASK), state)
@@ -294,11 +294,10 @@ def stage_functions(
     )
 
 
-def make_strategy(config: SearchConfig) -> ES:
+def make_strategy(config: SearchConfig, env: Env) -> ES:
     """The strategy, with a start that looks at the world's typical places if asked."""
     if config.start == "normal":
         return truncation_es(config)
-    env = make_env(config.train.env)
 
     def start(key: Key) -> jax.Array:
         lidars = typical_lidars(env, jax.random.key(0))

@@ -63,7 +63,7 @@ def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
         for name in LABELS
     ]
     acting, states = policy_states(
-        train, jax.tree.map(lambda *leaves: np.stack(leaves), *loaded)
+        env, train, jax.tree.map(lambda *leaves: np.stack(leaves), *loaded)
     )
     evaluate = make_evaluator(env, acting, num_episodes, watch=watch_first)
     result, episodes = evaluate(states, jax.random.key(seed))

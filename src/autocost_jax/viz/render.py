@@ -103,8 +103,11 @@ def run_player(
     """
     train: TrainConfig = config.train
     file = policy_files(run, [] if policy is None else [policy])[-1]
-    agent, states = load_policies(train, [file])
-    state = jax.tree.map(lambda leaf: leaf[0], states)
+
+    def make_agent(env: Env) -> tuple[Agent, Any]:
+        agent, states = load_policies(env, train, [file])
+        return agent, jax.tree.map(lambda leaf: leaf[0], states)
+
     card, theta = _card(run), None
     if card and file.stem.startswith("best_"):
         theta = load_arrays(run / "cost.npz", None)["theta"]
@@ -113,7 +116,7 @@ def run_player(
         config=train.env,
         name=file.stem,
         actions="mean" if deterministic else "sampled",
-        make_agent=lambda env: (agent, state),
+        make_agent=make_agent,
         page=run / "replays" / f"{file.stem}.html",
         theta=theta,
     )
