@@ -11,10 +11,10 @@ can be stopped and started again; finished ones are kept.
 Tests, stated before the runs:
 
 - The mean extrinsic cost of the candidates falls from the first stage to the last: the
-  95 % bootstrap interval of the fall lies above 0. It is over places of the population,
-  as each has its own training seed, the same in both stages; for each search, and for
-  all places of the searches together. The last stage ends below the control's and keeps
-  a quarter of the reference's return.
+  95 % bootstrap interval of the fall, over candidates, lies above 0; for each search,
+  and for the candidates of all searches together. The last stage ends below the
+  control's and keeps a quarter of the reference's return. All stages of a search train
+  with the same seeds: the fall is that of the costs, seen by these seeds.
 - Of the best cost's agents, trained with fresh seeds for the preset's length, at most a
   quarter as many episodes violate as with the extrinsic cost alone, at 30 % of its
   return or more, for each algorithm. The search chose this cost among its finalists by
@@ -85,15 +85,19 @@ def stages_of(path: Path) -> list[dict[str, np.ndarray]]:
 
 
 def bootstrap_difference(first: np.ndarray, last: np.ndarray) -> list[float]:
-    """95 % interval of mean(first - last) over resampled places of the population."""
+    """95 % interval of mean(first) - mean(last) over resampled candidates."""
     rng = np.random.default_rng(0)
-    index = rng.integers(len(first), size=(10_000, len(first)))
-    low, high = np.percentile((first - last)[index].mean(1), [2.5, 97.5])
+
+    def means(values: np.ndarray) -> np.ndarray:
+        index = rng.integers(len(values), size=(10_000, len(values)))
+        return values[index].mean(1)
+
+    low, high = np.percentile(means(first) - means(last), [2.5, 97.5])
     return [float(low), float(high)]
 
 
 def fall_of(paths: list[Path]) -> dict[str, Any]:
-    """The fall from the first stage to the last over all places of some searches."""
+    """The fall from the first stage to the last over all candidates of some searches."""
     stages = [stages_of(path) for path in paths]
     first, last = (
         np.concatenate([own[place]["cost"] for own in stages]) for place in (0, -1)

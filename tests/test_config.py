@@ -144,7 +144,7 @@ BAD = {
         "start": ("uniform", ""),
         "network": ("wide", ""),
         "seeds_per_candidate": COUNT,
-        "training_seeds": ("common", ""),
+        "training_seeds": ("candidate", ""),
         "references": (1, "yes"),
         "judge_by": ("best", "", "success"),  # success needs references
         "pool_scores": (1, "yes"),

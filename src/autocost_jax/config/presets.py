@@ -14,8 +14,8 @@ _LAPTOP_AGENT = AgentConfig(
     policy_minibatches=8,
     value_passes=4,
     value_minibatches=8,
-    multiplier_init=0.3,
-    multiplier_lr=0.005,
+    multiplier_init=0.5,
+    multiplier_lr=0.01,
     cg_iterations=5,
 )
 
@@ -29,7 +29,7 @@ _GUIDED: dict[str, Any] = {
     "mutation_high": 1.1,
     "references": True,
     "judge_by": "success",
-    "training_seeds": "candidate",
+    "training_seeds": "search",
     "pool_scores": True,
 }
 

@@ -22,7 +22,7 @@ Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
 Start = Literal["normal", "graded"]
 Judge = Literal["cost", "success"]
-TrainingSeeds = Literal["stage", "candidate"]
+TrainingSeeds = Literal["stage", "search"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 CostNetwork = Literal["lidar_mlp", "min_distance"]
 THETA_SIZES: dict[CostNetwork, int] = {"lidar_mlp": 41, "min_distance": 13}
@@ -181,10 +181,9 @@ class SearchConfig:
     Options of ours beside the paper's rule, all off by default. `start="graded"` draws
     first costs that rise as anything comes nearer, with a set reach and loudness, see
     `graded_start`. Each candidate is trained with `seeds_per_candidate` seeds
-    and judged by their mean. With `training_seeds="stage"` all candidates of a stage
-    share these seeds, and every stage has new ones; with "candidate" each place of the
-    population has its own, the same in every stage: then neither a stage nor its mean
-    hangs on one seed, and an elite meets another seed in another place. With
+    and judged by their mean. All candidates share these seeds; each stage has new ones,
+    or with `training_seeds="search"` those of the first: then two stages differ by
+    their costs alone. With
     `references` each algorithm trains two more costs
     with as many seeds in every stage, the extrinsic cost alone and with a margin of 3x.
     `judge_by="success"` compares candidates with the first of them, by violating
