@@ -97,7 +97,7 @@ def bootstrap_difference(first: np.ndarray, last: np.ndarray) -> list[float]:
 
 
 def fall_of(paths: list[Path]) -> dict[str, Any]:
-    """The fall from the first stage to the last over all candidates of some searches."""
+    """The fall over all candidates of some searches together."""
     stages = [stages_of(path) for path in paths]
     first, last = (
         np.concatenate([own[place]["cost"] for own in stages]) for place in (0, -1)

@@ -37,7 +37,8 @@ WHEELS = (("left", -0.03), ("right", 0.03))  # body, x of the wheel's centre
 NEAREST = {"Point": 3, "Car": 3, "Doggo": 4}
 NEAREST_TO_BOX = 2
 # Contacts that the solver sees, the deepest ones: on the floor (a wheel has two at a
-# time; a Doggo's hind shanks may touch each other besides), with pillars, with a box or vase, and between that and floor or pillars.
+# time; a Doggo's hind shanks may touch each other besides), with pillars, with a box or
+# vase, and between that and floor or pillars.
 FLOOR_CONTACTS = {"Point": 0, "Car": 5, "Doggo": 10}
 PILLAR_CONTACTS = {"Point": 4, "Car": 6, "Doggo": 4}
 SOLID_CONTACTS = 8
