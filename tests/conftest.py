@@ -45,7 +45,7 @@ def pytest_terminal_summary(
 
 def pytest_configure(config: pytest.Config) -> None:
     """The plain run is on the CPU; `-m gpu` takes what there is."""
-    marks = config.getoption("markexpr", "")
+    marks = str(config.getoption("markexpr", ""))
     if marks != "gpu":
         jax.config.update("jax_platforms", "cpu")
     if (
