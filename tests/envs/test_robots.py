@@ -19,7 +19,7 @@ OPEN_LOOP_C = 1e-5
 # Share of control steps whose velocities agree; where a contact appears or not in the
 # last digit they may differ by anything.
 NEARLY_ALL, NEAR, ALMOST_ALL, CLOSE = 0.90, 1e-3, 0.98, 2e-2  # design 6
-EXTREME = 0.97  # share of the steps with every motor at a limit; 0.98 and more were measured
+EXTREME = 0.97  # share of the steps with every motor at a limit; 0.98 is measured
 OBSERVED = 1e-2  # 90 % of the rows of every sensor; the accelerometer in m/s^2
 
 
