@@ -23,6 +23,7 @@ RESULTS = Path(__file__).parents[1] / "experiments" / "results"
         ("fitness", "fitness", "rules"),
         ("learners", "learners", "settings"),
         ("starts", "starts", None),
+        ("touches", "touches", "robots"),
     ],
 )
 def test_tables_are_those_of_the_committed_json(script, folder, rows):

@@ -37,7 +37,7 @@ class EnvConfig:
 
     `physics` chooses the model: "full" has Safety Gym's geoms at condim 6 (pillars as
     capsules, which MJX needs), "reduced" fewer and simpler contacts with the same
-    masses; `envs/models.py` lists them. "closed_form" is for a Point that nothing can
+    masses; `envs/physics/models.py` lists them. "closed_form" is for a Point that nothing can
     touch, with its equations of motion in place of MJX: the same numbers, faster.
     """
 
