@@ -1,12 +1,12 @@
 """What the figures of the paper share: cost designs, training, statistics, pictures.
 
 A *design* is a training cost and its limit, trained by PPO-Lagrangian and CPO with
-every seed. A figure is a list of designs and worlds: `Figure`, `main`. What it lacks in
+every seed. A figure is a list of designs and worlds, see `figures.py`. What it lacks in
 a world is trained side by side, as one table of slots; what another figure has trained
 already is taken from there.
 
-    python experiments/cost_limits.py run       # train what is not trained yet
-    python experiments/cost_limits.py collect   # JSON, table, picture of all runs
+    python experiments/figures.py run cost_limits      # train what is not trained yet
+    python experiments/figures.py collect cost_limits  # JSON, table, picture
 
 `--scale reduced` (default) fits a CPU and is no result of the paper's scale, which is
 `--scale paper`; `reduced_2m` trains four times as long. `reduced_10m` has the paper's
@@ -386,7 +386,7 @@ def collect(figure: Figure, scale: Scale, runs: Path, results: Path) -> None:
         "paper": figure.paper,
         "world": scale.world,
         "scale": scale.name,
-        "command": command(figure.name, scale),
+        "command": command("figures", scale, figure.name),
         "found": {name: str(cost) for name, cost in scale.found.items()},
         "seeds": list(scale.seeds),
         "facts": facts,
@@ -399,11 +399,12 @@ def collect(figure: Figure, scale: Scale, runs: Path, results: Path) -> None:
     print(file)
 
 
-def command(script: str, scale: Scale) -> str:
-    """What trains a figure."""
+def command(script: str, scale: Scale, figure: str = "") -> str:
+    """What trains what a script is about."""
     world = f"--world {scale.world} " if scale.world != WORLD else ""
     size = "--smoke" if scale.name == "smoke" else f"--scale {scale.name}"
-    return f"python experiments/{script}.py run {world}{size}"
+    name = f"{figure} " if figure else ""
+    return f"python experiments/{script}.py run {name}{world}{size}"
 
 
 def write(result: dict[str, Any], name: str, results: Path) -> Path:
@@ -551,13 +552,17 @@ def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
     return args
 
 
-def main(figure: Figure, description: str | None) -> None:
-    """The command line of a figure."""
+def main(figures: Sequence[Figure], description: str | None) -> None:
+    """The command line of the figures."""
+    known = {figure.name: figure for figure in figures}
     flags = parser(description)
-    flags.add_argument("--only", nargs="+", choices=figure.worlds, help="what to run")
+    flags.add_argument("figure", choices=known)
+    flags.add_argument("--only", nargs="+", help="worlds to run")
     args = arguments(flags)
-    scale = scales(args.world)[args.scale]
+    figure, scale = known[args.figure], scales(args.world)[args.scale]
     only = args.only if args.part == "run" and args.only else figure.worlds
+    if not set(only) <= set(figure.worlds):
+        flags.error(f"--only must be out of {', '.join(figure.worlds)}")
     worlds = tuple(in_world(name, args.world) for name in only)
     figure = figure._replace(worlds=worlds)
     if args.part == "run":

@@ -114,7 +114,11 @@ TRIED = (
     *(Shape("hinge", 2.0, constant=constant) for constant in (1e-4, 1e-3)),
     *(Shape("hinge", m, 10.0) for m in (2.0, 1.5)),
 )
-MARKERS = {"margin_2x": "D", "evolved": "*", "evolved_dense": "P"}  # of `margins.py`
+MARKERS = {
+    "margin_2x": "D",
+    "evolved": "*",
+    "evolved_dense": "P",
+}  # of the figure "margins"
 
 
 def slot(shape: Shape, seed: int) -> Slot:

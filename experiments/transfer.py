@@ -3,7 +3,7 @@
     python experiments/transfer.py run      # play exported policies there
     python experiments/transfer.py collect  # compare with our own fresh episodes
 
-Plays the policies that `other_tasks.py` and `other_robots.py` have trained, in the
+Plays the policies that `figures.py` has trained for other tasks and robots, in the
 interpreter `--python` that has safety-gymnasium (`benchmarks/peers.py` makes one).
 """
 

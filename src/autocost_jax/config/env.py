@@ -37,8 +37,9 @@ class EnvConfig:
 
     `physics` chooses the model: "full" has Safety Gym's geoms at condim 6 (pillars as
     capsules, which MJX needs), "reduced" fewer and simpler contacts with the same
-    masses; `envs/physics/models.py` lists them. "closed_form" is for a Point that nothing can
-    touch, with its equations of motion in place of MJX: the same numbers, faster.
+    masses; `envs/physics/models.py` lists them. "closed_form" is for a Point that
+    nothing can touch, with its equations of motion in place of MJX: the same numbers,
+    faster.
     """
 
     task: TaskName = "Goal"
