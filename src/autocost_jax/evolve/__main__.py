@@ -56,16 +56,14 @@ def _main(argv: list[str]) -> None:
     # Before anything of JAX runs:
     group = (options.coordinator, options.num_processes, options.process_id)
     devices = use_devices(options.devices, *group)
-    from autocost_jax.envs.env import make_env
-    from autocost_jax.runs.search_run import describe, run_search
+    from autocost_jax.runs.search_run import plan, run_search
     from autocost_jax.viz.run_data import write_run_report
 
     sizes = options.preset or "laptop"
     name = f"{sizes}-{config.train.env.name}-seed{config.seed}"
     path = options.out or Path("runs") / name
     if options.dry_run:
-        lines = describe(config, make_env(config.train.env), len(devices))
-        print("\n".join([*lines, f"would write to {path}"]))
+        print(plan(config, path, len(devices)))
         return
     run_search(
         config,

@@ -13,7 +13,7 @@ import numpy as np
 
 from autocost_jax.agents.base import actor
 from autocost_jax.config import SearchConfig
-from autocost_jax.envs.env import Env
+from autocost_jax.envs.env import Env, make_env
 from autocost_jax.files import flatten
 from autocost_jax.runs import cluster
 from autocost_jax.runs.directory import RunDir, open_run
@@ -112,6 +112,12 @@ def describe(config: SearchConfig, env: Env, num_devices: int) -> list[str]:
             f"for {config.epochs_of(config.num_stages)} epochs",
         )
     return lines
+
+
+def plan(config: SearchConfig, path: Path, num_devices: int) -> str:
+    """What a run in `path` would do; nothing is made there."""
+    lines = describe(config, make_env(config.train.env), num_devices)
+    return "\n".join([*lines, f"would write to {path}"])
 
 
 def check_memory(config: SearchConfig, env: Env, devices: Sequence[Any]) -> None:
