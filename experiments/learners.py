@@ -57,11 +57,6 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
         1,
         SMALL | {"multiplier_init": 0.5, "multiplier_lr": 0.01},
     ),
-    "32-32, multiplier from 0.3 at 0.005": (
-        8,
-        1,
-        SMALL | {"multiplier_init": 0.3, "multiplier_lr": 0.005},
-    ),
 }
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 

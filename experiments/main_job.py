@@ -13,8 +13,7 @@ Tests, stated before the runs:
 - The mean extrinsic cost of the candidates falls from the first stage to the last: the
   95 % bootstrap interval of the fall, over candidates, lies above 0; for each search,
   and for the candidates of all searches together. The last stage ends below the
-  control's and keeps a quarter of the reference's return. All stages of a search train
-  with the same seeds: the fall is that of the costs, seen by these seeds.
+  control's and keeps a quarter of the reference's return.
 - Of the best cost's agents, trained with fresh seeds for the preset's length, at most a
   quarter as many episodes violate as with the extrinsic cost alone, at 30 % of its
   return or more, for each algorithm. The search chose this cost among its finalists by

@@ -144,7 +144,6 @@ BAD = {
         "start": ("uniform", ""),
         "network": ("wide", ""),
         "seeds_per_candidate": COUNT,
-        "training_seeds": ("candidate", ""),
         "references": (1, "yes"),
         "judge_by": ("best", "", "success"),  # success needs references
         "pool_scores": (1, "yes"),
@@ -253,7 +252,7 @@ PROMISED = {
         "nets": (16, 16),
     },
 }
-EPOCHS = {"laptop": 40, "search": 64, "paper": 333, "smoke": 2}
+EPOCHS = {"laptop": 36, "search": 64, "paper": 333, "smoke": 2}
 FITNESS_EPOCHS = {"laptop": 12, "search": 16, "paper": 10, "smoke": 1}
 
 

@@ -448,21 +448,6 @@ def test_seeds_and_references_are_slots(key):
     assert used["safety_margin_3x"] == [15, 16, 17]
 
 
-def test_all_stages_may_have_the_seeds_of_the_first(key):
-    """But for the finalists, whose seeds are fresh."""
-    candidates = jax.random.normal(key, (4, 41))
-    sizes = {"references": True, "seeds_per_candidate": 2, "num_finalists": 2}
-    config = dataclasses.replace(CONFIG, training_seeds="search", **sizes)
-
-    def keys_of(stage, **options):
-        groups = stage_slots(config, key, stage, candidates, **options)
-        return [jax.random.key_data(slots.key) for slots in groups]
-
-    first, later, final = keys_of(0), keys_of(1), keys_of(2, is_final=True)
-    np.testing.assert_array_equal(first, later)
-    assert not np.isin(np.asarray(final), np.asarray(first)).any()
-
-
 FINALS = dataclasses.replace(
     CONFIG,
     train=train_config(num_epochs=3),

@@ -29,7 +29,6 @@ _GUIDED: dict[str, Any] = {
     "mutation_high": 1.1,
     "references": True,
     "judge_by": "success",
-    "training_seeds": "search",
     "pool_scores": True,
 }
 
@@ -39,16 +38,15 @@ PRESETS: dict[str, SearchConfig] = {
             env=EnvConfig(physics="closed_form"),
             agent=_LAPTOP_AGENT,
             num_worlds=8,
-            num_epochs=40,
+            num_epochs=36,
             chunk_epochs=2,
         ),
         population_size=16,
         num_elites=3,
         num_stages=2,
         fitness_epochs=12,
-        num_finalists=7,
-        final_seeds=2,
-        final_epochs=104,
+        num_finalists=4,
+        final_epochs=110,
         **_GUIDED,
     ),
     "search": SearchConfig(

@@ -22,7 +22,6 @@ Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
 Start = Literal["normal", "graded"]
 Judge = Literal["cost", "success"]
-TrainingSeeds = Literal["stage", "search"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 CostNetwork = Literal["lidar_mlp", "min_distance"]
 THETA_SIZES: dict[CostNetwork, int] = {"lidar_mlp": 41, "min_distance": 13}
@@ -181,10 +180,9 @@ class SearchConfig:
     Options of ours beside the paper's rule, all off by default. `start="graded"` draws
     first costs that rise as anything comes nearer, with a set reach and loudness, see
     `graded_start`. Each candidate is trained with `seeds_per_candidate` seeds and
-    judged by their mean. All candidates share these seeds; each stage has new ones, or
-    with `training_seeds="search"` those of the first: then two stages differ by their
-    costs alone. With `references` each algorithm trains two more costs with as many
-    seeds in every stage, the extrinsic cost alone and with a margin of 3x.
+    judged by their mean. All candidates of a stage share these seeds, and each stage has
+    new ones. With `references` each algorithm trains two more costs with as many seeds
+    in every stage, the extrinsic cost alone and with a margin of 3x.
     `judge_by="success"` compares candidates with the first of them, by violating
     episodes and return and for each algorithm, see `shortfall`; the paper's
     rule alone rewards costs that make agents flee or stand still, as these are the
@@ -214,7 +212,6 @@ class SearchConfig:
     start: Start = "normal"
     network: CostNetwork = "lidar_mlp"
     seeds_per_candidate: int = 1
-    training_seeds: TrainingSeeds = "stage"
     references: bool = False
     judge_by: Judge = "cost"
     pool_scores: bool = False
@@ -267,7 +264,6 @@ class SearchConfig:
             "selection": Selection,
             "start": Start,
             "judge_by": Judge,
-            "training_seeds": TrainingSeeds,
             "network": CostNetwork,
         }
         for name, kind in literals.items():

@@ -166,8 +166,7 @@ def stage_slots(
         candidates = candidates[: config.num_finalists]
     costs = stage_costs(config, candidates, bank)
     cost = jax.tree.map(lambda leaf: leaf[dealt.cost], costs)
-    keeps_seeds = config.training_seeds == "search" and not is_final
-    key = stage_key(root, 0 if keeps_seeds else stage, SLOTS)
+    key = stage_key(root, stage, SLOTS)
 
     def group(index: int) -> Slot:
         own = jax.random.fold_in(key, index)
