@@ -180,9 +180,9 @@ class SearchConfig:
     Options of ours beside the paper's rule, all off by default. `start="graded"` draws
     first costs that rise as anything comes nearer, with a set reach and loudness, see
     `graded_start`. Each candidate is trained with `seeds_per_candidate` seeds and
-    judged by their mean. All candidates of a stage share these seeds, and each stage has
-    new ones. With `references` each algorithm trains two more costs with as many seeds
-    in every stage, the extrinsic cost alone and with a margin of 3x.
+    judged by their mean; a stage's candidates share these seeds, and each stage has new
+    ones. With `references` each algorithm trains two more costs with as many seeds in
+    every stage, the extrinsic cost alone and with a margin of 3x.
     `judge_by="success"` compares candidates with the first of them, by violating
     episodes and return and for each algorithm, see `shortfall`; the paper's
     rule alone rewards costs that make agents flee or stand still, as these are the
