@@ -275,7 +275,8 @@ def table(result: dict[str, Any]) -> str:
     for row in result["validation"]:
         rates = ", ".join(f"{rate:.0%}" for rate in row["violation_rate"])
         lines.append(
-            f"| {row['cost']} | {row['algorithm']} | {_series(row['return'], 1)} | "
+            f"| {row['cost'].replace('paper_', 'best of search ')} | "
+            f"{row['algorithm']} | {_series(row['return'], 1)} | "
             f"{rates} | {row['violations_left']:.0%} | {row['return_kept']:.0%} | "
             f"{'yes' if row['reached'] else 'no'} |"
         )
