@@ -45,13 +45,8 @@ def pytest_terminal_summary(
 
 def pytest_configure(config: pytest.Config) -> None:
     """The plain run is on the CPU; `-m gpu` takes what there is."""
-    marks = str(config.getoption("markexpr", ""))
-    if marks != "gpu":
+    if config.getoption("markexpr", "") != "gpu":
         jax.config.update("jax_platforms", "cpu")
-    if (
-        "not slow" in marks
-    ):  # short runs: LLVM's optimisations take longer than they save
-        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
 
