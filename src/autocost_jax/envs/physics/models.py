@@ -344,9 +344,9 @@ def _reduce_car(spec: Any) -> _Hull:
 def _reduce_doggo(spec: Any) -> _Hull:
     """Every geom on the floor; at objects outer legs and a torso of two capsules.
 
-    Of its own parts only the hind shanks touch each other: the next pair, torso and a
-    front shank, did so in 21 of 1,000,000 steps of the scene, and more than ten contacts
-    stood in 1 (`experiments/touches.py`).
+    Of its own parts only the hind shanks touch each other: in 1,000,000 steps of the
+    scene the next pair, torso and a front shank, did so in 21, and more than ten
+    contacts stood in one (`experiments/touches.py`).
     """
     floor = [geom.name for geom in spec.geoms if geom.name not in ("floor", *BOX_PARTS)]
     floor = [name for name in floor if not name.startswith("vase")]
