@@ -158,12 +158,10 @@ def test_bad_values_are_refused_by_name():
     for kind, fields in BAD.items():
         for name, values in fields.items():
             for value in values:
-                with pytest.raises(ValueError, match=r"must be") as caught:
+                expected = rf"^{name} must be .*, got "
+                with pytest.raises(ValueError, match=expected) as caught:
                     kind(**{name: value})
-                message = str(caught.value)
-                assert message.startswith(f"{name} must be "), (kind, name, value)
-                assert ", got " in message
-                assert "\n" not in message
+                assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", BAD)

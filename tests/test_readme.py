@@ -193,11 +193,18 @@ def test_flags_and_settings_of_the_documents_exist(capsys):
     with pytest.raises(SystemExit):
         evolve_main(["--help"])
     text, pages = capsys.readouterr().out, " ".join(DOCS.values())
-    for flag in ("physics", "no-compile-cache", "coordinator", "num-processes"):
+    flags = ["physics", "no-compile-cache", "num-finalists"]
+    for flag in [*flags, "coordinator", "num-processes", "process-id"]:
         assert f"--{flag}" in pages
         assert f"--{flag}" in text
     names = re.findall(r"--set ([a-z_]+)=", pages) + re.findall(r"`(\w+): \w+`", pages)
-    assert {"segments_per_episode", "judge_by", "network"} <= set(names)
+    assert {"segments_per_episode", "population_chunk", "critic_precision"} <= set(
+        names
+    )
+    assert {"start", "judge_by", "network"} <= set(names)
+    options = {"seeds_per_candidate", "pool_scores", "references", "normalize_obs"}
+    assert all(f"`{name}`" in pages for name in options)
+    names += options
     for name in names:
         with pytest.raises(ValueError, match=f"{name} must be "):
             replace_fields(preset("laptop"), {name: object()})

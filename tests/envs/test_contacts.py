@@ -5,6 +5,7 @@ The scene itself, in MuJoCo C, is first held against recordings of the original.
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -24,6 +25,7 @@ from autocost_jax.envs.physics.models import (
     scene_model,
 )
 from autocost_jax.envs.physics.world import make_world
+from autocost_jax.envs.tasks import make_task
 from autocost_jax.records import Layout
 
 FLOAT64 = 1e-9
@@ -355,7 +357,7 @@ def point_drives() -> tuple[Layout, scenes.Policy]:
 
 
 def test_point_meets_pillars_when_the_scene_does():
-    """The first contact, and where the robot then leans; one world is recorded."""
+    """The first contact, and where the robot then leans."""
     world = compiled("Goal-Pillar-Point")
     layouts, policy = point_drives()
     num_steps = 80
@@ -375,13 +377,42 @@ def test_point_meets_pillars_when_the_scene_does():
     head_on = got.touches[:, kinds == 0]
     np.testing.assert_array_equal(head_on, expected.touches[:, kinds == 0])
     assert np.mean(got.touches == expected.touches) > 0.9
+
+
+def replay(name: str, layout: Layout, action: np.ndarray, num_steps: int) -> Any:
+    """A constant action in MJX: qpos [T, nq], reward [T] and cost [T].
+
+    All worlds of the compiled batch do the same; the first is returned.
+    """
+    env, *_, step = compiled(name)
+    model = env.mj_model
+    data = mujoco.MjData(model)
+    scenes.put(model, data, scenes.start_qpos(env.config, model, layout), 0.0)
+    mujoco.mj_kinematics(model, data)
+    names = ["robot", *(["box"] if env.config.task == "Push" else [])]
+    bodies: Any = SimpleNamespace(**{body: data.body(body).xpos for body in names})
+    distances: Any = make_task(env.config).distances(layout, bodies)  # pyright: ignore
+    layouts = scenes.stack_layouts([layout] * NUM)
+    still = np.zeros((NUM, model.nv))
+    state = scenes.worlds_at(env, layouts, np.tile(data.qpos, (NUM, 1)), still)
+    state = state.replace(task_distances=jnp.tile(distances, (NUM, 1)))
+    seen = []
+    for _ in range(num_steps):
+        state = step(state, np.tile(action, (NUM, 1)))
+        seen.append([x[0] for x in (state.data.qpos, state.reward, state.cost)])
+    return [np.array(column) for column in zip(*seen, strict=True)]
+
+
+def test_pillar_is_touched_when_the_record_says():
     recorded = load("pillar_head_on")
-    np.testing.assert_array_equal(layouts.pillars[0][0], recorded["pillar"])
-    seen = recorded["contact"][1 : num_steps + 1]
-    assert seen.any()
-    np.testing.assert_array_equal(got.touches[:, 0], seen)
-    error = got.qpos[:, 0, :2] - recorded["qpos"][1 : num_steps + 1, :2]
-    assert np.abs(error).max() < ONSET_XY
+    far = np.array([[4.0, 4.0], [4.0, -4.0], [-4.0, 4.0]])
+    pillars = np.concatenate([recorded["pillar"][None], far])
+    config = env_config("Goal-Pillar-Point")
+    layout = blank_layout(config, pillars=pillars, goal_xy=np.array([9.0, 9.0]))
+    qpos, _, cost = replay("Goal-Pillar-Point", layout, recorded["action"], 300)
+    assert recorded["contact"][1:].any()
+    np.testing.assert_array_equal(cost, recorded["cost_indicator"][1:])
+    np.testing.assert_allclose(qpos[:, :2], recorded["qpos"][1:, :2], atol=ONSET_XY)
 
 
 # The box has four feet for twenty and the arrow is a bar: single steps agree roughly,
@@ -412,10 +443,7 @@ def test_single_steps_of_a_point_at_the_box():
 
 
 def test_point_meets_the_box_when_the_scene_does():
-    """Straight, offset, rotated and far boxes, until five steps after the contact.
-
-    The first world is recorded.
-    """
+    """Straight, offset, rotated and far boxes, until five steps after the contact."""
     world = compiled("Push-Hazard-Point")
     config = world.env.config
     rng = np.random.default_rng(5)
@@ -443,15 +471,35 @@ def test_point_meets_the_box_when_the_scene_does():
         np.testing.assert_allclose(a, b, atol=1e-2)
         a, b = got.qpos[onset + 4, row, 3:5], expected.qpos[onset + 4, row, 3:5]
         np.testing.assert_allclose(a, b, atol=0.1)
+
+
+def test_box_is_pushed_as_recorded_until_shortly_after_contact():
     recorded = load("push_point_straight")
-    np.testing.assert_array_equal(batch.box_xy[0], recorded["box0"])
+    config = env_config("Push-Hazard-Point")
+    layout = blank_layout(
+        config,
+        hazards=np.full((config.hazards_num, 2), 9.0),
+        goal_xy=recorded["goal"],
+        box_xy=recorded["box0"],
+        box_yaw=recorded["box_rot0"],
+    )
+    model = compiled("Push-Hazard-Point").env.mj_model
+    assert float(model.body("box").mass[0]) == pytest.approx(
+        float(recorded["box_mass"])
+    )
     onset = int(np.argmax(recorded["robot_box_contacts"] > 0))
-    seen, expected_qpos = got.qpos[: onset + 3, 0], recorded["qpos"][1 : onset + 4]
-    moved = np.abs(seen[:, 3:5] - recorded["box0"]).max(-1)
+    steps = onset + 3
+    qpos, reward, _ = replay("Push-Hazard-Point", layout, recorded["action"], steps)
+    assert 0 < onset < 100
+    moved = np.abs(qpos[:, 3:5] - recorded["box0"]).max(-1)
     assert (moved[: onset - 1] < 1e-4).all()
     assert moved[-1] > 1e-3
-    for part, slack in ((slice(0, 2), ONSET_XY), (slice(3, 5), 2 * ONSET_XY)):
-        np.testing.assert_allclose(seen[:, part], expected_qpos[:, part], atol=slack)
+    expected = recorded["qpos"][1 : steps + 1]
+    np.testing.assert_allclose(qpos[:, :2], expected[:, :2], atol=ONSET_XY)
+    np.testing.assert_allclose(qpos[:, 3:5], expected[:, 3:5], atol=2 * ONSET_XY)
+    np.testing.assert_allclose(
+        reward[: onset - 1], recorded["reward"][1:onset], atol=1e-5
+    )
 
 
 @pytest.mark.slow
