@@ -138,11 +138,11 @@ def validation_rows(papers: list[Path], path: Path) -> list[dict[str, Any]]:
     file = path / "evaluation.json"
     table = json.loads(file.read_text())["rows"] if file.exists() else []
 
-    def of(algorithm: str, label: str) -> tuple[list[float], list[float]]:
+    def of(algorithm: str, label: str) -> list[list[float]]:
         rows = [row for row in table if row["method"] == f"{algorithm} {label}"]
-        return tuple(
+        return [
             [row[name] for row in rows] for name in ("violation_rate", "return_mean")
-        )  # pyright: ignore[reportReturnType]
+        ]
 
     out = []
     for algorithm in read_config(papers[0])[0].algorithms if table else ():
@@ -171,23 +171,19 @@ def search_row(paper: Path, control: Path) -> dict[str, Any]:
     stages = stages_of(paper)
     others = stages_of(control) if (control / "summary.json").exists() else []
     costs = [stage["cost"] for stage in stages]
-    first, last = costs[0], costs[-1]
     reference = [float(stage["references/ep_return"][:, 0].mean()) for stage in stages]
     returns = [float(stage["ep_return"].mean()) for stage in stages]
-    interval = bootstrap_difference(first, last)
     row = {
         "seed": config.seed,
         "stage_costs": [float(cost.mean()) for cost in costs],
         "stage_returns": returns,
         "reference_returns": reference,
         "control_stage_costs": [float(stage["cost"].mean()) for stage in others],
-        "fall": float(first.mean() - last.mean()),
-        "fall_95": interval,
+        **fall_of([paper]),
         "return_share": returns[-1] / reference[-1],
         "device": facts["device"],
         "versions": facts["versions"],
     }
-    row["falls"] = interval[0] > 0
     row["below_control"] = None  # the control has not been run
     if others:
         row["below_control"] = row["control_stage_costs"][-1] > row["stage_costs"][-1]

@@ -28,7 +28,7 @@ mujoco: Any = untyped_mujoco  # its compiled names have no stubs
 ROBOTS = ("Point", "Car", "Doggo")
 KINDS = ("uniform", "constant", "alternating", "bang-bang", "smooth", "sines")
 STEPS, EPISODE = 1_000_000, 250
-RARE = 1e-4  # share of steps that a missing pair may touch
+RARE = 1e-4  # share of the steps in which what is left out may touch
 
 
 def actions(kind: str, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:

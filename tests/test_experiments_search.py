@@ -10,6 +10,7 @@ import pytest
 
 from autocost_jax.config import preset
 from autocost_jax.costs import load_cost
+from autocost_jax.envs.physics.models import FLOOR_CONTACTS
 from autocost_jax.runs.directory import RunDir
 from scripts import load_script
 
@@ -152,3 +153,18 @@ def test_the_validation_compares_the_means_of_its_seeds(tmp_path):
     assert margin["violations_left"] == pytest.approx(0.375)
     assert best["return_kept"] == pytest.approx(0.4)
     assert [row["reached"] for row in (margin, best)] == [False, True]
+
+
+def test_what_the_reduced_models_leave_out_touches_rarely():
+    touches = load_script("experiments/touches")
+    result = json.loads((RESULTS / "touches" / "touches.json").read_text())
+    assert [found["robot"] for found in result["robots"]] == list(touches.ROBOTS)
+    for found in result["robots"]:
+        assert found["steps"] == touches.STEPS
+        reduced = touches.reduced_pairs(found["robot"])
+        for row in found["pairs"]:
+            assert row["in_reduced_model"] == (frozenset(row["pair"]) in reduced)
+            assert row["in_reduced_model"] or row["share"] < touches.RARE
+        most = FLOOR_CONTACTS[found["robot"]]
+        more = [x for n, x in found["contacts"].items() if int(n) > most]
+        assert sum(more) < touches.RARE

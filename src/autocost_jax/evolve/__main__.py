@@ -82,15 +82,13 @@ def _base(options: Any) -> SearchConfig:
     from autocost_jax.runs.config_files import read_settings, replace_fields
     from autocost_jax.runs.directory import read_config
 
+    base = preset(options.preset or "laptop")
     source = options.config
+    if source is not None and source.is_file():
+        return replace_fields(base, read_settings(source))
     if source is None and options.resume and options.preset is None:
         source = options.out
-    if source is None:
-        return preset(options.preset or "laptop")
-    if options.config is not None and source.is_file():
-        settings = read_settings(source)
-        return replace_fields(preset(options.preset or "laptop"), settings)
-    return read_config(source)[0]
+    return base if source is None else read_config(source)[0]
 
 
 def _planned(name: str, config: SearchConfig) -> float | None:
