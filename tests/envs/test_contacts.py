@@ -391,14 +391,14 @@ def replay(name: str, layout: Layout, action: np.ndarray, num_steps: int) -> Any
     mujoco.mj_kinematics(model, data)
     names = ["robot", *(["box"] if env.config.task == "Push" else [])]
     bodies: Any = SimpleNamespace(**{body: data.body(body).xpos for body in names})
-    distances: Any = make_task(env.config).distances(layout, bodies)  # pyright: ignore
+    distances: Any = make_task(env.config).distances(layout, bodies)
     layouts = scenes.stack_layouts([layout] * NUM)
     still = np.zeros((NUM, model.nv))
     state = scenes.worlds_at(env, layouts, np.tile(data.qpos, (NUM, 1)), still)
     state = state.replace(task_distances=jnp.tile(distances, (NUM, 1)))
     seen = []
     for _ in range(num_steps):
-        state = step(state, np.tile(action, (NUM, 1)))
+        state = step(state, jnp.tile(jnp.asarray(action), (NUM, 1)))
         seen.append([x[0] for x in (state.data.qpos, state.reward, state.cost)])
     return [np.array(column) for column in zip(*seen, strict=True)]
 
