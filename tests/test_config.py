@@ -110,6 +110,7 @@ BAD = {
         "multiplier_init": POSITIVE,
         "multiplier_lr": POSITIVE,
         "cg_damping": POSITIVE,
+        "violation_factor": POSITIVE,
         "policy_passes": COUNT,
         "policy_minibatches": COUNT,
         "value_passes": COUNT,

@@ -4,10 +4,14 @@ import json
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
+import jax
+import numpy as np
 import pytest
 
-from autocost_jax import env_config, preset
+import autocost_jax
+from autocost_jax import CostInputs, Fitness, env_config, preset, total_cost, train
 from autocost_jax.cli import HELP
 from autocost_jax.config import ENVS
 from autocost_jax.envs.physics.models import scene_model
@@ -15,6 +19,7 @@ from autocost_jax.evolve.__main__ import main as evolve_main
 from autocost_jax.runs.config_files import replace_fields
 from autocost_jax.search.starts import LOUD_COSTS, QUIET_PLACES
 from scripts import load_script
+from toys import TRAIN, make_slot, make_toy_env
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -54,6 +59,35 @@ def test_the_python_example_runs(capsys):
     first, second = capsys.readouterr().out.strip().splitlines()
     assert len(first.split()) == 2
     assert 0.0 <= float(second) <= 1.0
+
+
+def test_what_the_documents_extend_works():
+    """The page's functions, in a toy world and without a training."""
+    names: dict[str, Any] = {}
+    for code in re.findall(r"```python\n(.*?)```", DOCS["extending"], re.S):
+        exec(compile(code, "extending.md", "exec"), names)
+    zeros = np.zeros(3)
+    inputs = CostInputs(zeros, np.zeros((3, 8)), np.array([0.4, 0.6, 2]), zeros, zeros)  # pyright: ignore
+    got = total_cost(names["cost"], inputs, names["bank"])
+    np.testing.assert_allclose(got, [0.1, 0, 0], rtol=1e-6)
+
+    env = make_toy_env()
+    agent, slot = names["linear"](env), make_slot()
+    _, metrics = jax.eval_shape(lambda slot: train(env, agent, slot, TRAIN), slot)
+    assert metrics["gradient"].shape == (TRAIN.num_epochs,)
+
+    config = preset("laptop")
+    ep_return = jax.random.normal(jax.random.key(0), (config.population_size,))
+    fitness = Fitness(-ep_return, ep_return)
+    es, state = names["es"], names["es"].init()
+    theta = es.ask(jax.random.key(0), state)
+    told = es.tell(jax.random.key(0), state, theta, fitness)
+    np.testing.assert_array_equal(told.elites[0], theta[ep_return.argmax()])
+
+
+def test_the_page_of_the_interface_has_every_public_name():
+    names = re.findall(r"^::: autocost_jax\.(\w+)$", DOCS["api"], re.M)
+    assert sorted(names) == sorted(autocost_jax.__all__)
 
 
 @pytest.mark.parametrize("name", ["laptop (default)", "search", "paper", "smoke"])

@@ -122,6 +122,7 @@ BANK: tuple[CostTerm, ...] = (
     safety_margin(2.0),
     safety_margin(3.0),
 )
+"""The cost terms of the package; a longer tuple adds a user's own."""
 
 
 def total_cost(

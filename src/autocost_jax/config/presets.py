@@ -89,6 +89,7 @@ PRESETS: dict[str, SearchConfig] = {
         **_GUIDED,
     ),
 }
+"""The named sizes of a search, by their names."""
 
 
 def preset(name: str) -> SearchConfig:

@@ -37,6 +37,8 @@ class AgentConfig:
     that of the hidden layers in the critics' own steps, nowhere else: tensorfloat32
     (of a GPU; float32 elsewhere) or bfloat16 for speed. `normalize_obs` (ours) brings
     every observation to mean 0 and deviation 1 over what the agent has seen.
+    `violation_factor` (ours, 1 in the literature) times its violation of the limit is
+    what a CPO step is made to remove: above 1 safety comes before the return.
     """
 
     hidden_sizes: tuple[int, ...] = (256, 256)
@@ -62,6 +64,7 @@ class AgentConfig:
     cg_damping: float = 0.1
     backtrack_steps: int = 10
     backtrack_ratio: float = 0.8
+    violation_factor: float = 1.0
 
     def __post_init__(self) -> None:
         require_counts(
@@ -105,6 +108,7 @@ class AgentConfig:
             "multiplier_init",
             "multiplier_lr",
             "cg_damping",
+            "violation_factor",
         )
         ratio = self.backtrack_ratio
         require(0 < ratio < 1, "backtrack_ratio", "in (0, 1)", ratio)
