@@ -36,7 +36,7 @@ from autocost_jax.runs.sweep import Method, SweepConfig, sweep_slots
 STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
 COSTS = ("extrinsic", "extrinsic+safety_margin_2x", "extrinsic+safety_margin_3x")
 NORM = {"normalize_obs": True}
-SMALL: dict[str, Any] = {  # with the last line of SETTINGS the `laptop` preset
+SMALL: dict[str, Any] = {
     "normalize_obs": True,
     "hidden_sizes": (32, 32),
     "target_kl": 0.02,
@@ -44,6 +44,8 @@ SMALL: dict[str, Any] = {  # with the last line of SETTINGS the `laptop` preset
     "value_passes": 4,
     "cg_iterations": 5,
 }
+MILD = SMALL | {"multiplier_init": 0.5, "multiplier_lr": 0.01}
+SHORT = MILD | {"gae_lambda": 0.95, "cost_gae_lambda": 0.95}
 # name -> worlds an epoch, segments per episode, agent settings that differ from REDUCED
 SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "as before": (8, 1, {}),
@@ -52,11 +54,14 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "4 worlds, multiplier lr 0.02": (4, 1, NORM | {"multiplier_lr": 0.02}),
     "4 worlds in 4 cohorts": (4, 4, NORM),
     "32-32, multiplier from 1 at 0.02": (8, 1, SMALL | {"multiplier_lr": 0.02}),
-    "32-32, multiplier from 0.5 at 0.01": (
+    "32-32, multiplier from 0.5 at 0.01": (8, 1, MILD),
+    "and lambda 0.95": (8, 1, SHORT),
+    "CPO removes 1.25 x its violation": (
         8,
         1,
-        SMALL | {"multiplier_init": 0.5, "multiplier_lr": 0.01},
+        SHORT | {"violation_factor": 1.25},
     ),
+    "or 2 x": (8, 1, SHORT | {"violation_factor": 2.0}),
 }
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 

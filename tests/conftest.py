@@ -65,6 +65,17 @@ def compilation_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def optimisation(request: pytest.FixtureRequest) -> None:
+    """Programs of tests run once or twice: to compile them takes the time.
+
+    So it is done without optimisations, which halves it; a module whose programs run
+    for longer says `pytestmark = pytest.mark.optimised`.
+    """
+    optimised = request.node.get_closest_marker("optimised") is not None
+    jax.config.update("jax_disable_most_optimizations", not optimised)
+
+
 @pytest.fixture
 def key() -> jax.Array:
     return jax.random.key(0)

@@ -145,6 +145,7 @@ BAD = {
         "start": ("uniform", ""),
         "network": ("wide", ""),
         "seeds_per_candidate": COUNT,
+        "training_seeds": ("common", ""),
         "references": (1, "yes"),
         "judge_by": ("best", "", "success"),  # success needs references
         "pool_scores": (1, "yes"),

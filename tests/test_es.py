@@ -1,6 +1,7 @@
 """Selection, mutation and the archive: the paper's rules as properties and goldens."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +60,13 @@ def places():
 
 
 jit_mutate = jax.jit(mutate, static_argnums=2)
+
+
+@functools.partial(jax.jit, static_argnames="network")
+def graded(key, places, quiet_places, loud_costs, network="lidar_mlp"):
+    """200 costs of the graded start, and what they say of the places [200, M]."""
+    theta = graded_start(key, 200, 8.0, places, network, quiet_places, loud_costs)
+    return theta, jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta)
 
 
 # Selection -------------------------------------------------------------------
@@ -138,7 +146,8 @@ def test_pooling_is_the_mean_over_all_trainings_of_a_candidate():
 
 def test_a_lucky_retraining_is_no_zero_violation(key):
     """The same theta cost 5 and then 0: it is at 2.5, and another one is best."""
-    es = truncation_es(dataclasses.replace(SMALL, pool_scores=True, num_elites=1))
+    config = dataclasses.replace(SMALL, pool_scores=True, num_elites=1)
+    es = jit_bundle(truncation_es(config))
     state, size = es.init(), SMALL.population_size
     costs = ([5.0, *[9.0] * (size - 1)], [0.0, 2.0, *[9.0] * (size - 2)])
     for stage, cost in enumerate(costs):
@@ -158,8 +167,8 @@ def test_a_lucky_retraining_is_no_zero_violation(key):
 
 @pytest.mark.parametrize("network", ["lidar_mlp", "min_distance"])
 def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network, places):
-    theta = graded_start(key, 200, 8.0, places, network)
-    costs = np.asarray(jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta))
+    theta, costs = graded(key, places, QUIET_PLACES, LOUD_COSTS, network)
+    costs = np.asarray(costs)
     quiet = 100 * (costs < QUIET_COST).mean(1)
     assert quiet.min() > QUIET_PLACES[0] - 1
     assert quiet.max() < QUIET_PLACES[1] + 1
@@ -170,13 +179,13 @@ def test_a_graded_start_is_as_loud_as_it_was_drawn(key, network, places):
     assert inside.mean() > 0.9  # the others' units are all but off
     share = np.log(loud[inside] / low) / np.log(high / low)
     np.testing.assert_allclose(share.mean(), 0.5, atol=SIGMAS * 0.29 / 200**0.5)
-    nearer = jax.vmap(lambda theta: intrinsic_cost(theta, 1.1 * places))(theta)
+    nearer = jax.jit(jax.vmap(intrinsic_cost, (0, None)))(theta, 1.1 * places)
     assert bool((nearer >= costs).all())
 
 
 def test_a_graded_start_hears_all_directions(key, places):
     """No hidden unit is all but deaf in one of the eight: |N| weights would be."""
-    theta = np.asarray(graded_start(key, 200, 8.0, places))
+    theta = np.asarray(graded(key, places, QUIET_PLACES, LOUD_COSTS)[0])
     weights = theta[:, : 8 * HIDDEN].reshape(-1, 8, HIDDEN)
     weakest = weights.min(1) / weights.mean(1)
     assert weakest.mean() > 0.5
@@ -185,10 +194,7 @@ def test_a_graded_start_hears_all_directions(key, places):
 
 
 def test_a_graded_start_keeps_to_other_ranges(key, places):
-    theta = graded_start(
-        key, 50, 8.0, places, quiet_places=(60.0, 70.0), loud_costs=(0.4, 0.5)
-    )
-    costs = np.asarray(jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta))
+    costs = np.asarray(graded(key, places, (60.0, 70.0), (0.4, 0.5))[1])
     quiet = 100 * (costs < QUIET_COST).mean(1)
     assert (quiet > 59).all()
     assert (quiet < 71).all()
@@ -202,8 +208,8 @@ def test_a_search_hands_its_world_to_its_start(key):
     es = make_strategy(dataclasses.replace(config, start="graded", **sizes), env)
     first = jax.jit(es.ask)(key, es.init())
     places = jax.jit(lambda key: typical_lidars(env, key))(jax.random.key(0))
-    costs = jax.vmap(lambda theta: intrinsic_cost(theta, places))
-    quiet = 100 * np.mean(np.asarray(costs(first)) < QUIET_COST, axis=1)
+    costs = jax.jit(jax.vmap(intrinsic_cost, (0, None)))(first, places)
+    quiet = 100 * np.mean(np.asarray(costs) < QUIET_COST, axis=1)
     assert quiet.min() > QUIET_PLACES[0] - 1
     assert quiet.max() < QUIET_PLACES[1] + 1
 

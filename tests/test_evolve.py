@@ -49,6 +49,7 @@ def environment(tmp_path_factory):
     names = os.environ | {
         "XDG_CACHE_HOME": str(cache),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
     }
     return {k: v for k, v in names.items() if k != "JAX_COMPILATION_CACHE_DIR"}
 

@@ -233,9 +233,9 @@ def test_all_candidates_may_diverge():
 
 
 def test_non_finite_replay_stays_strict_json():
-    recording = make_recording(20)
+    recording = make_recording(50)
     recording.qpos[12:], recording.reward[4] = np.nan, np.inf
-    intrinsic = np.full(20, np.nan)
+    intrinsic = np.full(50, np.nan)
     replay = scene.make_replay(EnvConfig(hazards_num=4), recording, intrinsic=intrinsic)
     check_page(report.render_report(make_data(replays=(replay,))))
 
@@ -471,17 +471,18 @@ def test_the_best_cost_is_shown_first_beside_the_reference(labels, expected):
 
 
 def test_a_comparison_needs_two_episodes(tmp_path):
-    one, path = make_replay(steep_theta(), 9), tmp_path / "new" / "page.html"
+    one, path = make_replay(steep_theta(), 50), tmp_path / "new" / "page.html"
     with pytest.raises(ValueError, match="at least two, got 1"):
         report.write_comparison([one], "", "", path)
-    empty = dataclasses.replace(make_replay(steep_theta(), 9), steps=0)
+    empty = dataclasses.replace(make_replay(steep_theta(), 50), steps=0)
     with pytest.raises(ValueError, match="at least one step"):
         report.write_comparison([one, empty], "", "", path)
     assert not path.exists()
 
 
 def test_a_comparison_is_one_page(tmp_path):
-    pair = [make_replay(steep_theta(), n, label) for n, label in ((30, "a"), (60, "b"))]
+    lengths = {"a": 50, "b": 100}
+    pair = [make_replay(steep_theta(), n, label) for label, n in lengths.items()]
     text = f"First {HOSTILE}.\n\nSecond."
     path = report.write_comparison(pair, HOSTILE, text, tmp_path / "a" / "page.html")
     page = check_page(path.read_text())
@@ -530,7 +531,7 @@ def test_wrong_shapes_are_refused():
     with pytest.raises(ValueError, match=r"references\[0\]\.cost"):
         dataclasses.replace(data, references=(reference,))
     with pytest.raises(ValueError, match=r"replay\.reward"):
-        dataclasses.replace(make_replay(steep_theta(), 9), reward=np.zeros(3))
+        dataclasses.replace(make_replay(steep_theta(), 50), reward=np.zeros(3))
 
 
 @pytest.mark.slow
@@ -583,14 +584,14 @@ def test_browser_plays_the_replay(tmp_path):
 def test_one_slider_moves_two_replays(tmp_path):
     """The shorter episode waits at its end; both say where they are."""
     pair = [
-        make_replay(steep_theta(), 40, "CPO, best cost"),
+        make_replay(steep_theta(), 50, "CPO, best cost"),
         make_replay(steep_theta(), 100, "CPO, extrinsic cost alone"),
     ]
     page = report.write_comparison(pair, "Two", "", tmp_path / "two.html")
     dom, log = browse(tmp_path, page, address="#step=25")
     assert (frame_of(dom, 0), frame_of(dom, 1)) == (25, 25)
     dom, log = browse(tmp_path, page, address="#step=70")
-    assert (frame_of(dom, 0), frame_of(dom, 1)) == (40, 70)
+    assert (frame_of(dom, 0), frame_of(dom, 1)) == (50, 70)
     assert 'id="now-step">step 70 of 100<' in dom
     assert "CONSOLE" not in log
 

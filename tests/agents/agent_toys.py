@@ -70,7 +70,7 @@ def stack_problem(agent, num_slots=4):
         return state, trajectory, cost, make_slot(limit), key_update
 
     keys = jax.random.split(jax.random.key(0), num_slots)
-    return jax.vmap(one)(keys, jnp.arange(num_slots, dtype=jnp.float32))
+    return jax.jit(jax.vmap(one))(keys, jnp.arange(num_slots, dtype=jnp.float32))
 
 
 def fisher_product(distribution, theta, weight, damping):

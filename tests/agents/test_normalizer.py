@@ -62,7 +62,7 @@ def test_an_agent_learns_its_normalizer(make, key):
     obs, action = act(agent, state, key)
     trajectory = make_trajectory(obs, action, action[..., 0])
     cost = jnp.zeros_like(trajectory.reward)
-    after, _ = agent.update(state, trajectory, cost, make_slot(), key)
+    after, _ = jax.jit(agent.update)(state, trajectory, cost, make_slot(), key)
     rows = np.asarray(obs[:-1]).reshape(-1, obs.shape[-1])
     np.testing.assert_allclose(after.normalizer.mean, rows.mean(0), rtol=1e-4)
     # The same networks act otherwise once observations are normalised.

@@ -10,7 +10,7 @@ from autocost_jax.interop.brax import BraxEnv
 
 @pytest.fixture(scope="module")
 def env():
-    return make_env(EnvConfig(num_steps=5))
+    return make_env(EnvConfig(num_steps=5, physics="closed_form"))
 
 
 def test_steps_like_the_env_underneath(env):

@@ -9,6 +9,8 @@ from autocost_jax.config.training import AgentConfig, SearchConfig, TrainConfig
 _LAPTOP_AGENT = AgentConfig(
     normalize_obs=True,
     hidden_sizes=(32, 32),
+    gae_lambda=0.95,
+    cost_gae_lambda=0.95,
     target_kl=0.02,
     policy_passes=4,
     policy_minibatches=8,
@@ -17,6 +19,7 @@ _LAPTOP_AGENT = AgentConfig(
     multiplier_init=0.5,
     multiplier_lr=0.01,
     cg_iterations=5,
+    violation_factor=1.2,
 )
 
 # Long stages rather than many (`experiments/fitness.py`), a start among costs of which
@@ -29,6 +32,7 @@ _GUIDED: dict[str, Any] = {
     "mutation_high": 1.1,
     "references": True,
     "judge_by": "success",
+    "training_seeds": "candidate",
     "pool_scores": True,
 }
 

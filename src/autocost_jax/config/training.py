@@ -22,6 +22,7 @@ Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
 Start = Literal["normal", "graded"]
 Judge = Literal["cost", "success"]
+TrainingSeeds = Literal["stage", "candidate"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 CostNetwork = Literal["lidar_mlp", "min_distance"]
 THETA_SIZES: dict[CostNetwork, int] = {"lidar_mlp": 41, "min_distance": 13}
@@ -184,9 +185,12 @@ class SearchConfig:
     Options of ours beside the paper's rule, all off by default. `start="graded"` draws
     first costs that rise as anything comes nearer, with a set reach and loudness, see
     `graded_start`. Each candidate is trained with `seeds_per_candidate` seeds and
-    judged by their mean; a stage's candidates share these seeds, and each stage has new
-    ones. With `references` each algorithm trains two more costs with as many seeds in
-    every stage, the extrinsic cost alone and with a margin of 3x.
+    judged by their mean. With `training_seeds="stage"` a stage's candidates share these
+    seeds, and each stage has new ones; with "candidate" each place of the population
+    has its own, the same in every stage, so that stages compare place by place and
+    their means do not hang on one seed. With `references` each algorithm trains two
+    more costs with as many seeds in every stage, the extrinsic cost alone and with a
+    margin of 3x.
     `judge_by="success"` compares candidates with the first of them, by violating
     episodes and return and for each algorithm, see `shortfall`; the paper's
     rule alone rewards costs that make agents flee or stand still, as these are the
@@ -216,6 +220,7 @@ class SearchConfig:
     start: Start = "normal"
     network: CostNetwork = "lidar_mlp"
     seeds_per_candidate: int = 1
+    training_seeds: TrainingSeeds = "stage"
     references: bool = False
     judge_by: Judge = "cost"
     pool_scores: bool = False
@@ -268,6 +273,7 @@ class SearchConfig:
             "selection": Selection,
             "start": Start,
             "judge_by": Judge,
+            "training_seeds": TrainingSeeds,
             "network": CostNetwork,
         }
         for name, kind in literals.items():

@@ -13,6 +13,15 @@ from autocost_jax.envs.sensors import lidar
 Array = np.ndarray[Any, Any]
 
 
+@jax.jit
+@jax.vmap
+def _see(place: jax.Array) -> jax.Array:
+    return lidar(place[None], jnp.zeros(3), jnp.eye(3), num_bins=LIDAR_BINS)
+
+
+_cost = jax.jit(intrinsic_cost)
+
+
 def object_lidar(ego_xy: Array) -> Array:
     """The constraint lidar of a single object.
 
@@ -22,14 +31,10 @@ def object_lidar(ego_xy: Array) -> Array:
     Returns:
       [..., 8] readings in [0, 1]; several objects combine by their maximum.
     """
-
-    def see(place: jax.Array) -> jax.Array:
-        return lidar(place[None], jnp.zeros(3), jnp.eye(3), num_bins=LIDAR_BINS)
-
     places = jnp.asarray(ego_xy, jnp.float32).reshape(-1, 2)
-    return np.asarray(jax.vmap(see)(places)).reshape(*np.shape(ego_xy)[:-1], LIDAR_BINS)
+    return np.asarray(_see(places)).reshape(*np.shape(ego_xy)[:-1], LIDAR_BINS)
 
 
 def network_cost(theta: Array, lidar: Array) -> Array:
     """`costs.intrinsic_cost` [...] of theta [D] and readings [..., 8]."""
-    return np.asarray(intrinsic_cost(jnp.asarray(theta), jnp.asarray(lidar)), float)
+    return np.asarray(_cost(jnp.asarray(theta), jnp.asarray(lidar)), float)

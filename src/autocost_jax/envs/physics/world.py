@@ -91,13 +91,15 @@ def make_world(config: EnvConfig) -> World:
         ctrl = jnp.clip(action.astype(rest.ctrl.dtype), low, high)
         mocap_pos = _mocap_positions(scene, layout, state.qpos)
         start = rest.replace(ctrl=ctrl, mocap_pos=mocap_pos)
+        moving = (state.qpos, state.qvel, state.qacc_warmstart)
+        time = state.time + num_substeps * model.opt.timestep
+        if physics.has_contacts and jax.default_backend() == "cpu":
+            return _steps_in_one_loop(scene, start, moving, time, num_substeps)
 
         def body(_, moving: Moving) -> Moving:
             return substep(model, start, moving)
 
-        moving = (state.qpos, state.qvel, state.qacc_warmstart)
         moving = jax.lax.fori_loop(0, num_substeps, body, moving)
-        time = state.time + num_substeps * model.opt.timestep
         return _observe(scene, start, moving, time)
 
     sensors, sizes = make_readings(mj_model)
@@ -217,18 +219,49 @@ def _observe(
     scene: _Scene, start: mjx.Data, moving: Moving, time: jax.Array
 ) -> PhysicsState:
     """The state that `moving` is, its sensors and contacts evaluated."""
+    return _state(scene, scene.forward(scene.model, _at(start, moving)), time)
+
+
+def _at(start: mjx.Data, moving: Moving) -> mjx.Data:
     qpos, qvel, warmstart = moving
-    data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-    data = scene.forward(scene.model, data)
+    return start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+
+
+def _state(scene: _Scene, data: mjx.Data, time: jax.Array) -> PhysicsState:
+    """What is kept of data after `forward`, whose sensors are read here."""
+    data = _sense(scene.model, data)
     return PhysicsState(
-        qpos=qpos,
-        qvel=qvel,
-        ctrl=start.ctrl,
+        qpos=data.qpos,
+        qvel=data.qvel,
+        ctrl=data.ctrl,
         qacc_warmstart=data.qacc_warmstart,
         sensordata=data.sensordata,
         time=time,
         bodies=_bodies(scene, data),
     )
+
+
+def _steps_in_one_loop(
+    scene: _Scene, start: mjx.Data, moving: Moving, time: jax.Array, num_steps: int
+) -> PhysicsState:
+    """The state after some physics steps with contacts, as a CPU likes it.
+
+    One more round of the loop evaluates the state at its end, so that the dynamics are
+    compiled once, not twice: a third less to compile, at the same speed. A GPU would
+    have to be asked in each round whether it is the last.
+    """
+    shapes = jax.eval_shape(lambda: _observe(scene, start, moving, time))
+    unseen = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def body(index: jax.Array, carry: tuple[Moving, PhysicsState]):
+        moving, seen = carry
+        data = scene.forward(scene.model, _at(start, moving))
+        is_end = index == num_steps
+        seen = jax.lax.cond(is_end, lambda: _state(scene, data, time), lambda: seen)
+        after = mjx.euler(scene.model, data)
+        return (after.qpos, after.qvel, after.qacc_warmstart), seen
+
+    return jax.lax.fori_loop(0, num_steps + 1, body, (moving, unseen))[1]
 
 
 def _bodies(scene: _Scene, data: mjx.Data) -> Bodies:
@@ -323,31 +356,41 @@ def _contact_substep(
     forward: Forward, model: mjx.Model, start: mjx.Data, moving: Moving
 ) -> Moving:
     """One physics step with contacts; what is not carried on is never computed."""
-    qpos, qvel, warmstart = moving
-    data = start.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-    data = mjx.euler(model, forward(model, data))
+    data = mjx.euler(model, forward(model, _at(start, moving)))
     return data.qpos, data.qvel, data.qacc_warmstart
 
 
 def _make_forward(physics: PhysicsModel, rest: mjx.Data) -> Forward:
-    """`mjx.forward` with MuJoCo's contact frames and this package's solver."""
-    if not physics.has_contacts:
-        # `mjx.forward` skips the accelerometer where there is no constraint at all.
-        return lambda model, data: mjx.sensor_acc(model, mjx.forward(model, data))
-    solve = make_solver(physics.mj_model, rest)
+    """`mjx.forward` with MuJoCo's contact frames and this package's solver.
+
+    But for the sensors, see `_sense`.
+    """
+    solve = make_solver(physics.mj_model, rest) if physics.has_contacts else _unforced
     choices = physics.choices
 
     def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         data = mjx.com_pos(model, mjx.kinematics(model, data))
         data = mjx.factor_m(model, mjx.crb(model, data))
-        data = _align_frames(model, mjx.collision(model, data))
+        if physics.has_contacts:
+            data = _align_frames(model, mjx.collision(model, data))
         data = _keep_deepest(choices, data) if choices.any() else data
-        data = mjx.sensor_pos(model, mjx.transmission(model, data))
-        data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
+        data = mjx.fwd_velocity(model, mjx.transmission(model, data))
         data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-        return mjx.sensor_acc(model, solve(model, data))
+        return solve(model, data)
 
     return forward
+
+
+def _unforced(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """The solution where there is no constraint."""
+    del model
+    return data.replace(qacc=data.qacc_smooth)
+
+
+def _sense(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Data after `forward` with all sensors read."""
+    data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
+    return mjx.sensor_acc(model, data)
 
 
 def _align_frames(model: mjx.Model, data: mjx.Data) -> mjx.Data:
