@@ -15,6 +15,7 @@ from autocost_jax.config import (
     TrainConfig,
     preset,
 )
+from autocost_jax.config.checks import help_texts
 
 NAN, INF = float("nan"), float("inf")
 COUNT = (0, -1, 1.5, NAN, "3", True)
@@ -171,6 +172,13 @@ def test_every_field_has_a_bad_value_above(kind):
     nested = {"env", "agent", "train"}  # checked by their own classes
     fields = {field.name for field in dataclasses.fields(kind)} - nested
     assert fields == set(BAD[kind])
+
+
+def test_every_setting_says_in_one_line_what_it_is_for():
+    texts = help_texts(SearchConfig)
+    nested = {"env", "agent", "train"}
+    assert set(texts) == {name for fields in BAD.values() for name in fields} - nested
+    assert all(text and "\n" not in text for text in texts.values())
 
 
 @pytest.mark.parametrize("name", ["policy_minibatches", "value_minibatches"])

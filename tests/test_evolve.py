@@ -425,7 +425,9 @@ def test_the_settings_of_a_preset_are_a_file_that_gives_it_back(
     asked, capsys, tmp_path
 ):
     cli(["info", "--preset", "search"])
-    (tmp_path / "all.yaml").write_text(capsys.readouterr().out)
+    text = capsys.readouterr().out
+    assert re.search(r"^population_size: 50 +# candidates of a stage$", text, re.M)
+    (tmp_path / "all.yaml").write_text(text)
     main(["--preset", "smoke", "--config", str(tmp_path / "all.yaml")])
     assert asked[0][0] == preset("search")
 

@@ -15,7 +15,9 @@ from autocost_jax.commandline import (
     quiet,
     use_compile_cache,
     use_devices,
+    with_flags,
 )
+from autocost_jax.config import TrainConfig
 from autocost_jax.showing import demo, envs, render, report, run_config
 
 HELP = """usage: autocost COMMAND [flags]
@@ -68,9 +70,6 @@ def _train(argv: list[str]) -> None:
           set: any of them by its name, as in `--set hidden_sizes=[64,64]`, once for
             each; `autocost info --preset laptop` lists them.
           env: one of the worlds that `autocost info` lists.
-          physics: model of the world; closed_form, the fastest, for Points on a plane.
-          num_epochs: of training.
-          num_worlds: of a slot in an epoch.
           algorithms: ppo, ppo_lagrangian, cpo: one method each.
           cost: terms of the cost bank, such as "extrinsic+0.1*safety_margin_2x".
           limit: allowed training cost per episode.
@@ -93,9 +92,6 @@ def _train(argv: list[str]) -> None:
         preset: Literal["laptop", "search", "paper", "smoke"] | None = None
         set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
         env: str | None = None
-        physics: Literal["reduced", "full", "closed_form"] | None = None
-        num_epochs: int | None = None
-        num_worlds: int | None = None
         algorithms: tuple[Literal["ppo", "ppo_lagrangian", "cpo"], ...] = (
             "ppo_lagrangian",
         )
@@ -113,9 +109,10 @@ def _train(argv: list[str]) -> None:
         compile_cache: bool = True
         episodes: int = 100
 
-    options = parse(Options, argv, "autocost train")
-    recorded, train = _train_base(options)
     names = ("physics", "num_epochs", "num_worlds")
+    flagged = with_flags(Options, TrainConfig, names)
+    options = parse(flagged, argv, "autocost train")
+    recorded, train = _train_base(options)
     flags = {name: getattr(options, name) for name in names}
     train = config_with(train, options.env, flags, options.set)
     use_compile_cache(options.compile_cache)
@@ -285,7 +282,8 @@ def _info(argv: list[str]) -> None:
 
         Attributes:
           run: a run directory.
-          preset: all settings of a preset, as YAML that `--config` reads.
+          preset: all settings of a preset and what each is for, as YAML that
+            `--config` reads.
         """
 
         run: Path | None = None
@@ -295,15 +293,13 @@ def _info(argv: list[str]) -> None:
     import yaml
 
     from autocost_jax.config import ENVS, PRESETS, SUITE, preset
-    from autocost_jax.runs.config_files import read_document, to_dict
+    from autocost_jax.runs.config_files import read_document, settings_text
 
-    document = None
     if options.run is not None:
-        document = read_document(options.run)
-    elif options.preset is not None:
-        document = to_dict(preset(options.preset))
-    if document is not None:
-        print(yaml.safe_dump(document, sort_keys=False), end="")
+        print(yaml.safe_dump(read_document(options.run), sort_keys=False), end="")
+        return
+    if options.preset is not None:
+        print(settings_text(preset(options.preset)), end="")
         return
     from autocost_jax.costs import BANK, list_costs
     from autocost_jax.runs.directory import run_facts

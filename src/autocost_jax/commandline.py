@@ -9,9 +9,10 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from autocost_jax.config import EnvConfig, SearchConfig, TrainConfig, env_config
+from autocost_jax.config.checks import field_types, help_texts
 
 T = TypeVar("T")
 C = TypeVar("C", SearchConfig, TrainConfig)
@@ -41,6 +42,25 @@ def _first_sentence(panel: str) -> str:
     text = re.sub(r"^(Parsing error|Value error|Error parsing \S+:)\s+", "", text)
     advice = r"\s+(?:Argument helptext|For full helptext|Arguments similar)"
     return re.split(advice, text)[0]
+
+
+def with_flags(options: type, config: type, names: Sequence[str]) -> Any:
+    """A dataclass of options, with a flag for each named setting of a configuration.
+
+    These flags are None where they are not given; their types and help texts are the
+    fields'.
+    """
+    import tyro
+
+    hints, texts = field_types(config), help_texts(config)
+    fields = [
+        (name, Annotated[hints[name] | None, tyro.conf.arg(help=texts[name])], None)
+        for name in names
+    ]
+    doc = {"__doc__": options.__doc__}
+    return dataclasses.make_dataclass(
+        options.__name__, fields, bases=(options,), namespace=doc, frozen=True
+    )
 
 
 def config_with(

@@ -28,6 +28,8 @@ from autocost_jax.envs.physics.world import make_world
 from autocost_jax.envs.tasks import make_task
 from autocost_jax.records import Layout
 
+pytestmark = pytest.mark.optimised
+
 FLOAT64 = 1e-9
 # From the first contact on the record has two contacts with a pillar, the scene one.
 LEANING = 2e-4

@@ -20,6 +20,8 @@ from autocost_jax.records import EnvState, Layout
 mujoco: Any = untyped_mujoco  # its compiled names have no stubs
 Step = Callable[[EnvState, jax.Array], EnvState]
 
+pytestmark = pytest.mark.optimised
+
 FLOAT32 = 1e-5  # float32 against the engine's float64, design 6
 # Design 6 allows the Point 0.1 in yaw rate and the Car 2e-2 in velocity.
 STEP_QPOS, POINT_YAW_RATE, CAR_QVEL = 1e-4, 0.1, 5e-4

@@ -11,12 +11,17 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from autocost_jax.config.checks import (
-    is_finite,
-    is_integer,
+    COUNT,
+    FINITE,
+    NOT_NEGATIVE,
+    NUMBER,
+    POSITIVE,
+    POSITIVE_OR_NONE,
+    SWITCH,
+    check_fields,
+    one_of,
     require,
-    require_counts,
-    require_finite,
-    require_positive,
+    setting,
 )
 
 TaskName = Literal["Goal", "Push"]
@@ -35,85 +40,89 @@ class EnvConfig:
     before it (ISSA 2021, Safety Index Synthesis 2022). Later ones of that lab (GUARD)
     have 8, the crowded `Goal-Hazard8-*`. `env_config` has all the others.
 
-    `physics` chooses the model: "full" has Safety Gym's geoms at condim 6 (pillars as
-    capsules, which MJX needs), "reduced" fewer and simpler contacts with the same
-    masses; `envs/physics/models.py` lists them. "closed_form" is for a Point that
-    nothing can touch, with its equations of motion in place of MJX: the same numbers,
+    `physics` "full" has Safety Gym's geoms at condim 6 (pillars as capsules, which MJX
+    needs), "reduced" the same masses; `envs/physics/models.py` lists its contacts.
+    "closed_form" has a Point's equations of motion in place of MJX: the same numbers,
     faster.
     """
 
-    task: TaskName = "Goal"
-    robot: Robot = "Point"
-    physics: Physics = "reduced"
-    num_steps: int = 1000
-    frameskip_binom_n: int = 10
-    placements_extents: tuple[float, float, float, float] = (-2.0, -2.0, 2.0, 2.0)
-    placements_margin: float = 0.0
-    robot_keepout: float = 0.4
-    goal_size: float = 0.3
-    goal_keepout: float = 0.4
-    box_size: float = 0.2
-    box_keepout: float = 0.425  # ours: the box's reach; Safety Gym's 0.2 overlaps
-    box_density: float = 0.001
-    box_null_dist: float = 0.0
-    hazards_num: int = 4
-    hazards_size: float = 0.3
-    hazards_keepout: float = 0.4
-    hazards_cost: float = 1.0
-    observe_hazards: bool = True
-    constrain_hazards: bool = True
-    pillars_num: int = 0
-    pillars_size: float = 0.2
-    pillars_height: float = 0.5
-    pillars_keepout: float = 0.3
-    pillars_cost: float = 1.0
-    observe_pillars: bool = False
-    constrain_pillars: bool = False
-    vases_num: int = 0
-    vases_size: float = 0.1
-    vases_density: float = 0.001
-    vases_sink: float = 4e-5
-    vases_keepout: float = 0.15
-    vases_contact_cost: float = 1.0
-    vases_velocity_cost: float = 1.0
-    vases_velocity_threshold: float = 1e-4
-    observe_vases: bool = False
-    constrain_vases: bool = False
-    constrain_indicator: bool = False
-    lidar_num_bins: int = LIDAR_BINS
-    lidar_max_dist: float | None = None
-    lidar_exp_gain: float = 1.0
-    lidar_alias: bool = True
-    reward_distance: float = 1.0
-    reward_box_dist: float = 1.0
-    reward_box_goal: float = 1.0
-    reward_goal: float = 1.0
-    reward_clip: float = 10.0
+    task: TaskName = setting("Goal", one_of(TaskName), "what earns reward")
+    robot: Robot = setting("Point", one_of(Robot), "who acts")
+    physics: Physics = setting(
+        "reduced",
+        one_of(Physics),
+        "model of the world: full has every geom of Safety Gym, reduced fewer and "
+        "simpler contacts, closed_form none, for a Point that nothing can touch",
+    )
+    num_steps: int = setting(1000, COUNT, "steps of an episode")
+    frameskip_binom_n: int = setting(10, COUNT, "physics steps of an action")
+    placements_extents: tuple[float, float, float, float] = setting(
+        (-2.0, -2.0, 2.0, 2.0), None, "xmin, ymin, xmax, ymax of the arena"
+    )
+    placements_margin: float = setting(0.0, NOT_NEGATIVE, "gap between two keepouts")
+    robot_keepout: float = setting(0.4, POSITIVE, "free radius of the robot")
+    goal_size: float = setting(0.3, POSITIVE, "radius")
+    goal_keepout: float = setting(0.4, POSITIVE, "free radius")
+    box_size: float = setting(0.2, POSITIVE, "half width")
+    box_keepout: float = setting(
+        0.425, POSITIVE, "free radius; ours: the box's reach; Safety Gym's 0.2 overlaps"
+    )
+    box_density: float = setting(0.001, POSITIVE, "mass per volume")
+    box_null_dist: float = setting(
+        0.0, NOT_NEGATIVE, "box sizes; nearer than that nearing it earns nothing"
+    )
+    hazards_num: int = setting(4, NUMBER, "how many; ours, Safety Gym has none")
+    hazards_size: float = setting(0.3, POSITIVE, "radius")
+    hazards_keepout: float = setting(0.4, POSITIVE, "free radius")
+    hazards_cost: float = setting(1.0, FINITE, "cost of a step per metre inside")
+    observe_hazards: bool = setting(True, SWITCH, "by a lidar")
+    constrain_hazards: bool = setting(True, SWITCH, "whether they cost")
+    pillars_num: int = setting(0, NUMBER, "how many")
+    pillars_size: float = setting(0.2, POSITIVE, "radius")
+    pillars_height: float = setting(0.5, POSITIVE, "half height")
+    pillars_keepout: float = setting(0.3, POSITIVE, "free radius")
+    pillars_cost: float = setting(1.0, FINITE, "cost of a step in contact")
+    observe_pillars: bool = setting(False, SWITCH, "by a lidar")
+    constrain_pillars: bool = setting(False, SWITCH, "whether contact costs")
+    vases_num: int = setting(0, NUMBER, "how many")
+    vases_size: float = setting(0.1, POSITIVE, "half width")
+    vases_density: float = setting(0.001, POSITIVE, "mass per volume")
+    vases_sink: float = setting(4e-5, NOT_NEGATIVE, "depth in the floor at first")
+    vases_keepout: float = setting(0.15, POSITIVE, "free radius")
+    vases_contact_cost: float = setting(1.0, FINITE, "of each contact in a step")
+    vases_velocity_cost: float = setting(1.0, FINITE, "of a step per m/s of a vase")
+    vases_velocity_threshold: float = setting(
+        1e-4, NOT_NEGATIVE, "m/s from which a vase counts as moving"
+    )
+    observe_vases: bool = setting(False, SWITCH, "by a lidar")
+    constrain_vases: bool = setting(False, SWITCH, "whether they cost")
+    constrain_indicator: bool = setting(
+        False, SWITCH, "a step costs 1 wherever it costs at all"
+    )
+    lidar_num_bins: int = setting(LIDAR_BINS, COUNT, "directions of each lidar")
+    lidar_max_dist: float | None = setting(
+        None, POSITIVE_OR_NONE, "range of a linear lidar; null: it falls exponentially"
+    )
+    lidar_exp_gain: float = setting(
+        1.0, POSITIVE, "of the exponential: exp(-gain x distance)"
+    )
+    lidar_alias: bool = setting(True, SWITCH, "bins beside a target's read it, too")
+    reward_distance: float = setting(1.0, FINITE, "per metre nearer to the goal")
+    reward_box_dist: float = setting(1.0, FINITE, "per metre nearer to the box")
+    reward_box_goal: float = setting(
+        1.0, FINITE, "per metre that the box is nearer to the goal"
+    )
+    reward_goal: float = setting(1.0, FINITE, "of meeting the goal")
+    reward_clip: float = setting(10.0, POSITIVE, "largest reward of a step, either way")
 
     def __post_init__(self) -> None:
-        for name, kind in (("task", TaskName), ("robot", Robot), ("physics", Physics)):
-            value, allowed = getattr(self, name), get_args(kind)
-            require(value in allowed, name, f"one of {', '.join(allowed)}", value)
-        require_counts(self, "num_steps", "frameskip_binom_n", "lidar_num_bins")
+        check_fields(self)
         require(
             self.physics != "closed_form" or self.has_closed_form,
             "physics",
             "reduced or full where the robot is no Point or can touch something",
             self.physics,
         )
-        for name in _NUMBERS:
-            value = getattr(self, name)
-            require(is_integer(value) and value >= 0, name, "an integer >= 0", value)
-        for name in _SWITCHES:
-            value = getattr(self, name)
-            require(isinstance(value, bool), name, "true or false", value)
-        require_finite(self, *_FINITE)
-        for name in _NOT_NEGATIVE:
-            value = getattr(self, name)
-            require(is_finite(value) and value >= 0, name, "finite and >= 0", value)
-        require_positive(self, *_POSITIVE)
-        if self.lidar_max_dist is not None:
-            require_positive(self, "lidar_max_dist")
         require(
             len(self.constrained) > 0,
             "constrain_hazards, constrain_pillars, constrain_vases",
@@ -179,53 +188,6 @@ class EnvConfig:
             for kind in self.constrained
         )
         return f"{self.task}-{kinds}-{self.robot}-custom"
-
-
-_NUMBERS = ("hazards_num", "pillars_num", "vases_num")
-_SWITCHES = (
-    "observe_hazards",
-    "constrain_hazards",
-    "observe_pillars",
-    "constrain_pillars",
-    "observe_vases",
-    "constrain_vases",
-    "constrain_indicator",
-    "lidar_alias",
-)
-_FINITE = (
-    "hazards_cost",
-    "pillars_cost",
-    "vases_contact_cost",
-    "vases_velocity_cost",
-    "reward_distance",
-    "reward_box_dist",
-    "reward_box_goal",
-    "reward_goal",
-)
-_NOT_NEGATIVE = (
-    "placements_margin",
-    "box_null_dist",
-    "vases_sink",
-    "vases_velocity_threshold",
-)
-_POSITIVE = (
-    "goal_size",
-    "goal_keepout",
-    "robot_keepout",
-    "box_size",
-    "box_keepout",
-    "box_density",
-    "hazards_size",
-    "hazards_keepout",
-    "pillars_size",
-    "pillars_height",
-    "pillars_keepout",
-    "vases_size",
-    "vases_density",
-    "vases_keepout",
-    "lidar_exp_gain",
-    "reward_clip",
-)
 
 
 def _paper_env(task: TaskName, constraint: str, robot: Robot) -> EnvConfig:

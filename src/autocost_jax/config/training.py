@@ -6,15 +6,25 @@ AutoCost paper nor Safety Gym settles.
 """
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 from autocost_jax.config.checks import (
-    is_finite,
-    is_integer,
+    COUNT,
+    COUNTS,
+    DISCOUNT,
+    FINITE,
+    NOT_NEGATIVE,
+    NUMBER,
+    POSITIVE,
+    RATIO,
+    SEED,
+    SHARE,
+    SWITCH,
+    check_fields,
+    one_of,
     require,
-    require_counts,
-    require_finite,
-    require_positive,
+    setting,
+    some_of,
 )
 from autocost_jax.config.env import EnvConfig
 
@@ -34,85 +44,47 @@ class AgentConfig:
 
     Where the paper is silent they are Safety Gym's starter agents'. An update makes
     `policy_passes` x `policy_minibatches` policy steps (CPO: always one full-batch
-    step) and `value_passes` x `value_minibatches` critic steps. `critic_precision` is
-    that of the hidden layers in the critics' own steps, nowhere else: tensorfloat32
-    (of a GPU; float32 elsewhere) or bfloat16 for speed. `normalize_obs` (ours) brings
-    every observation to mean 0 and deviation 1 over what the agent has seen.
-    `violation_factor` (ours, 1 in the literature) times its violation of the limit is
-    what a CPO step is made to remove: above 1 safety comes before the return.
+    step) and `value_passes` x `value_minibatches` critic steps. `normalize_obs` and
+    `violation_factor` are ours. Lower `critic_precision` is for the hidden layers in
+    the critics' own steps alone: tensorfloat32 (of a GPU; float32 elsewhere) or
+    bfloat16.
     """
 
-    hidden_sizes: tuple[int, ...] = (256, 256)
-    normalize_obs: bool = False
-    log_std_init: float = -0.5
-    gamma: float = 0.99
-    gae_lambda: float = 0.97
-    cost_gamma: float = 0.99
-    cost_gae_lambda: float = 0.97
-    policy_lr: float = 4e-4
-    policy_passes: int = 80
-    policy_minibatches: int = 1
-    clip_eps: float = 0.2
-    target_kl: float = 0.01
-    kl_stop_factor: float = 1.2
-    value_lr: float = 1e-3
-    value_passes: int = 80
-    value_minibatches: int = 1
-    critic_precision: Precision = "float32"
-    multiplier_init: float = 1.0
-    multiplier_lr: float = 0.05
-    cg_iterations: int = 10
-    cg_damping: float = 0.1
-    backtrack_steps: int = 10
-    backtrack_ratio: float = 0.8
-    violation_factor: float = 1.0
+    hidden_sizes: tuple[int, ...] = setting(
+        (256, 256), COUNTS, "of the policy's and the critics' networks"
+    )
+    normalize_obs: bool = setting(
+        False, SWITCH, "bring observations to mean 0 and deviation 1 over all seen"
+    )
+    log_std_init: float = setting(-0.5, FINITE, "log deviation of actions at first")
+    gamma: float = setting(0.99, DISCOUNT, "discount of rewards")
+    gae_lambda: float = setting(0.97, SHARE, "of the reward's advantages")
+    cost_gamma: float = setting(0.99, DISCOUNT, "discount of costs")
+    cost_gae_lambda: float = setting(0.97, SHARE, "of the cost's advantages")
+    policy_lr: float = setting(4e-4, POSITIVE, "Adam's, of PPO's policy")
+    policy_passes: int = setting(80, COUNT, "over an epoch's rows, at most")
+    policy_minibatches: int = setting(1, COUNT, "of a pass")
+    clip_eps: float = setting(0.2, POSITIVE, "PPO's bound of the ratio")
+    target_kl: float = setting(0.01, POSITIVE, "trust region of an epoch")
+    kl_stop_factor: float = setting(1.2, POSITIVE, "PPO stops at this x target_kl")
+    value_lr: float = setting(1e-3, POSITIVE, "Adam's, of the critics")
+    value_passes: int = setting(80, COUNT, "over an epoch's rows")
+    value_minibatches: int = setting(1, COUNT, "of a pass")
+    critic_precision: Precision = setting(
+        "float32", one_of(Precision), "of the critics' hidden layers as they learn"
+    )
+    multiplier_init: float = setting(1.0, POSITIVE, "PPO-Lagrangian's at first")
+    multiplier_lr: float = setting(0.05, POSITIVE, "Adam's, of the multiplier")
+    cg_iterations: int = setting(10, COUNT, "of CPO's conjugate gradient")
+    cg_damping: float = setting(0.1, POSITIVE, "added to CPO's Fisher matrix")
+    backtrack_steps: int = setting(10, COUNT, "of CPO's line search, at most")
+    backtrack_ratio: float = setting(0.8, RATIO, "by which each shortens the step")
+    violation_factor: float = setting(
+        1.0, POSITIVE, "x its violation is what a CPO step is made to remove"
+    )
 
     def __post_init__(self) -> None:
-        require_counts(
-            self,
-            "policy_passes",
-            "policy_minibatches",
-            "value_passes",
-            "value_minibatches",
-            "cg_iterations",
-            "backtrack_steps",
-        )
-        require_finite(self, "log_std_init")
-        flag = self.normalize_obs
-        require(isinstance(flag, bool), "normalize_obs", "true or false", flag)
-        known = get_args(Precision)
-        require(
-            self.critic_precision in known,
-            "critic_precision",
-            f"one of {', '.join(known)}",
-            self.critic_precision,
-        )
-        require(
-            all(is_integer(size) and size >= 1 for size in self.hidden_sizes),
-            "hidden_sizes",
-            "a tuple of integers >= 1",
-            self.hidden_sizes,
-        )
-        for name in ("gamma", "cost_gamma"):
-            value = getattr(self, name)
-            require(0 < value <= 1, name, "in (0, 1]", value)
-        for name in ("gae_lambda", "cost_gae_lambda"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, name, "in [0, 1]", value)
-        require_positive(
-            self,
-            "policy_lr",
-            "value_lr",
-            "clip_eps",
-            "target_kl",
-            "kl_stop_factor",
-            "multiplier_init",
-            "multiplier_lr",
-            "cg_damping",
-            "violation_factor",
-        )
-        ratio = self.backtrack_ratio
-        require(0 < ratio < 1, "backtrack_ratio", "in (0, 1)", ratio)
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -130,19 +102,18 @@ class TrainConfig:
 
     env: EnvConfig = field(default_factory=EnvConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
-    num_worlds: int = 30
-    segments_per_episode: int = 1
-    num_epochs: int = 333
-    chunk_epochs: int = 1
-    population_chunk: int = 0
+    num_worlds: int = setting(30, COUNT, "of a slot in an epoch")
+    segments_per_episode: int = setting(
+        1, COUNT, "cohorts of num_worlds worlds, each a part of an episode ahead"
+    )
+    num_epochs: int = setting(333, COUNT, "of training in a stage")
+    chunk_epochs: int = setting(1, COUNT, "in one call of the program")
+    population_chunk: int = setting(
+        0, NUMBER, "slots that learn at once on a device; 0: as suits it"
+    )
 
     def __post_init__(self) -> None:
-        require_counts(
-            self, "num_worlds", "segments_per_episode", "num_epochs", "chunk_epochs"
-        )
-        chunk = self.population_chunk
-        ok = is_integer(chunk) and chunk >= 0
-        require(ok, "population_chunk", "an integer >= 0", chunk)
+        check_fields(self)
         k, steps = self.segments_per_episode, self.env.num_steps
         require(
             steps % k == 0, "segments_per_episode", f"a divisor of num_steps={steps}", k
@@ -204,40 +175,54 @@ class SearchConfig:
     """
 
     train: TrainConfig = field(default_factory=TrainConfig)
-    seed: int = 0
-    algorithms: tuple[Algorithm, ...] = ("ppo_lagrangian", "cpo")
-    cost_limit: float = 0.0
-    population_size: int = 50
-    num_elites: int = 5
-    num_stages: int = 7
-    fitness_epochs: int = 10
-    init_std: float = 1.0
-    mutation_std: float = 1.0
-    mutation_low: float = 0.5
-    mutation_high: float = 2.0
-    zero_tolerance: float = 0.0
-    selection: Selection = "paper"
-    start: Start = "normal"
-    network: CostNetwork = "lidar_mlp"
-    seeds_per_candidate: int = 1
-    training_seeds: TrainingSeeds = "stage"
-    references: bool = False
-    judge_by: Judge = "cost"
-    pool_scores: bool = False
-    num_finalists: int = 0
-    final_seeds: int = 3
-    final_epochs: int = 0
+    seed: int = setting(0, SEED, "of the search")
+    algorithms: tuple[Algorithm, ...] = setting(
+        ("ppo_lagrangian", "cpo"), some_of(Algorithm), "that train every candidate"
+    )
+    cost_limit: float = setting(0.0, FINITE, "allowed training cost per episode")
+    population_size: int = setting(50, COUNT, "candidates of a stage")
+    num_elites: int = setting(5, COUNT, "that are kept and mutated")
+    num_stages: int = setting(7, COUNT, "of selection")
+    fitness_epochs: int = setting(10, COUNT, "last epochs by which agents are judged")
+    init_std: float = setting(1.0, POSITIVE, "scale of the first costs' parameters")
+    mutation_std: float = setting(1.0, POSITIVE, "of what is added to a parameter")
+    mutation_low: float = setting(0.5, POSITIVE, "lowest factor of a parameter")
+    mutation_high: float = setting(2.0, POSITIVE, "highest factor of a parameter")
+    zero_tolerance: float = setting(
+        0.0, NOT_NEGATIVE, "highest mean cost that counts as no violation"
+    )
+    selection: Selection = setting(
+        "paper", one_of(Selection), "the paper's, or elites drawn at random: a control"
+    )
+    start: Start = setting(
+        "normal",
+        one_of(Start),
+        "first costs: the paper's, or of set reach and loudness",
+    )
+    network: CostNetwork = setting(
+        "lidar_mlp",
+        one_of(CostNetwork),
+        "the paper's of 8 readings, or of the highest alone",
+    )
+    seeds_per_candidate: int = setting(1, COUNT, "trainings by which one is judged")
+    training_seeds: TrainingSeeds = setting(
+        "stage",
+        one_of(TrainingSeeds),
+        "shared by a stage, or each place's own in all stages",
+    )
+    references: bool = setting(
+        False, SWITCH, "train the extrinsic cost alone and a 3x margin beside"
+    )
+    judge_by: Judge = setting(
+        "cost", one_of(Judge), "extrinsic cost, or how far from the bars of success"
+    )
+    pool_scores: bool = setting(False, SWITCH, "judge elites by all their trainings")
+    num_finalists: int = setting(0, NUMBER, "best ones to train again afterwards")
+    final_seeds: int = setting(3, COUNT, "fresh seeds of each finalist")
+    final_epochs: int = setting(0, NUMBER, "of a finalist; 0: as many as in a stage")
 
     def __post_init__(self) -> None:
-        require_counts(
-            self,
-            "population_size",
-            "num_elites",
-            "num_stages",
-            "fitness_epochs",
-            "seeds_per_candidate",
-            "final_seeds",
-        )
+        check_fields(self)
         size = self.population_size
         require(
             self.num_elites <= size,
@@ -251,55 +236,17 @@ class SearchConfig:
             f"in [1, num_epochs={self.train.num_epochs} // 3]",
             self.fitness_epochs,
         )
-        known = ("ppo_lagrangian", "cpo")
-        require(
-            len(self.algorithms) > 0
-            and len(set(self.algorithms)) == len(self.algorithms)
-            and all(name in known for name in self.algorithms),
-            "algorithms",
-            f"distinct names out of {', '.join(known)}",
-            self.algorithms,
-        )
-        require_positive(
-            self, "init_std", "mutation_std", "mutation_low", "mutation_high"
-        )
-        require_finite(self, "cost_limit")
         low, high = self.mutation_low, self.mutation_high
         require(high >= low, "mutation_high", f">= mutation_low={low}", high)
-        tolerance = self.zero_tolerance
-        ok = is_finite(tolerance) and tolerance >= 0
-        require(ok, "zero_tolerance", "finite and >= 0", tolerance)
-        literals = {
-            "selection": Selection,
-            "start": Start,
-            "judge_by": Judge,
-            "training_seeds": TrainingSeeds,
-            "network": CostNetwork,
-        }
-        for name, kind in literals.items():
-            value, known = getattr(self, name), get_args(kind)
-            require(value in known, name, f"one of {', '.join(known)}", value)
-        ok = is_integer(self.seed) and 0 <= self.seed < 2**32
-        require(ok, "seed", "an integer in [0, 2**32)", self.seed)
-        self._check_options()
-
-    def _check_options(self) -> None:
-        """The options of ours."""
-        for name in ("references", "pool_scores"):
-            flag = getattr(self, name)
-            require(isinstance(flag, bool), name, "true or false", flag)
         ok = self.references or self.judge_by != "success"
         require(ok, "judge_by", '"cost" without references', self.judge_by)
-        count, size = self.num_finalists, self.population_size
-        ok = is_integer(count) and 0 <= count <= size
-        require(ok, "num_finalists", f"in [0, population_size={size}]", count)
-        chunk, epochs = self.train.chunk_epochs, self.final_epochs
+        count = self.num_finalists
         require(
-            is_integer(epochs) and epochs >= 0 and epochs % chunk == 0,
-            "final_epochs",
-            f"a multiple of chunk_epochs={chunk}, or 0",
-            epochs,
+            count <= size, "num_finalists", f"in [0, population_size={size}]", count
         )
+        chunk, epochs = self.train.chunk_epochs, self.final_epochs
+        allowed = f"a multiple of chunk_epochs={chunk}, or 0"
+        require(epochs % chunk == 0, "final_epochs", allowed, epochs)
 
     @property
     def num_references(self) -> int:

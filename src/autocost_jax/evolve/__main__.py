@@ -20,6 +20,7 @@ from autocost_jax.commandline import (
     quiet,
     use_compile_cache,
     use_devices,
+    with_flags,
 )
 from autocost_jax.config import SearchConfig, preset
 
@@ -114,17 +115,6 @@ def _options_type() -> Any:
           set: any setting by its name, as in `--set mutation_std=0.5`, once for each;
             `autocost info --preset laptop` lists them.
           env: one of the worlds that `autocost info` lists.
-          physics: model of the world; closed_form, the fastest, for Points on a plane.
-          seed: of the search.
-          algorithms: that train every candidate.
-          cost_limit: allowed training cost per episode.
-          population_size: candidates of a stage.
-          num_elites: that are kept and mutated.
-          num_stages: of selection.
-          num_epochs: of training in a stage.
-          num_worlds: of a slot in an epoch.
-          num_finalists: that are trained again with fresh seeds after the last stage.
-          selection: the paper's, or the control that draws elites at random.
           out: run directory; default runs/PRESET-WORLD-seedN.
           resume: continue the run in `out` from its newest checkpoint.
           overwrite: start over in a directory that already holds a run.
@@ -142,17 +132,6 @@ def _options_type() -> Any:
         config: Path | None = None
         set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
         env: str | None = None
-        physics: Literal["reduced", "full", "closed_form"] | None = None
-        seed: int | None = None
-        algorithms: tuple[Literal["ppo_lagrangian", "cpo"], ...] | None = None
-        cost_limit: float | None = None
-        population_size: int | None = None
-        num_elites: int | None = None
-        num_stages: int | None = None
-        num_epochs: int | None = None
-        num_worlds: int | None = None
-        num_finalists: int | None = None
-        selection: Literal["paper", "random"] | None = None
         out: Path | None = None
         resume: bool = False
         overwrite: bool = False
@@ -164,7 +143,7 @@ def _options_type() -> Any:
         process_id: int | None = None
         compile_cache: bool = True
 
-    return Options
+    return with_flags(Options, SearchConfig, SETTINGS)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ import jax
 import numpy as np
 
 from autocost_jax.config import SearchConfig
+from autocost_jax.config.checks import help_texts
 from autocost_jax.files import RunDirError
 
 C = TypeVar("C")
@@ -117,6 +118,19 @@ def read_settings(file: str | Path) -> dict[str, Any]:
     if not isinstance(settings, dict):
         raise ValueError(f"{file} must be a mapping of settings, got {settings!r}")
     return settings
+
+
+def settings_text(config: Any) -> str:
+    """All settings of a config as YAML for `read_settings`, and what each is for."""
+    import yaml
+
+    texts = help_texts(type(config))
+    text = yaml.safe_dump(to_dict(config), sort_keys=False, default_flow_style=None)
+    lines = []
+    for line in text.splitlines():
+        name = line.split(":")[0].strip()
+        lines.append(f"{line:<40} # {texts[name]}" if name in texts else line)
+    return "\n".join(lines) + "\n"
 
 
 def config_hash(config: Any) -> str:
