@@ -21,7 +21,6 @@ Tests, stated before the runs:
   trained with all best costs and references side by side.
 """
 
-import argparse
 import dataclasses
 import json
 import subprocess
@@ -30,9 +29,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import run_if_needed
+from common import Options, run_if_needed, run_part
 
-from autocost_jax.commandline import use_devices
 from autocost_jax.costs import load_cost
 from autocost_jax.files import load_arrays
 from autocost_jax.runs.config_files import read_document, to_json
@@ -55,21 +53,19 @@ def search_dir(runs: Path, selection: str, seed: int) -> Path:
     return runs / f"{selection}_{seed}"
 
 
-def run(runs: Path, flags: list[str]) -> None:
+def run(options: Options) -> None:
     """The default job as a user runs it, and its controls, which need no finalists."""
     for selection in ("paper", "random"):
         for seed in SEEDS:
-            out = search_dir(runs, selection, seed)
+            out = search_dir(options.runs, selection, seed)
             if (out / "summary.json").exists():
                 continue
             command = [sys.executable, "-m", "autocost_jax.evolve", "--out", str(out)]
-            own = ["--seed", str(seed)]
+            own = ["--seed", str(seed), *(["--preset", "smoke"] * options.smoke)]
             if selection == "random":
                 own += ["--selection", "random", "--num-finalists", "0"]
             started = (out / "config.yaml").exists()
-            subprocess.run(
-                [*command, *(["--resume"] if started else [*own, *flags])], check=True
-            )
+            subprocess.run([*command, *(["--resume"] if started else own)], check=True)
 
 
 def finished(runs: Path) -> list[Path]:
@@ -126,11 +122,10 @@ def validation_table(papers: list[Path]) -> SweepConfig:
     return SweepConfig(train=train, methods=methods, seeds=VALIDATION_SEEDS)
 
 
-def validate(runs: Path) -> None:
+def validate(options: Options) -> None:
     """Train and score the table of all finished searches."""
-    use_devices(None)  # a device a core, before anything of JAX runs
-    table = validation_table(finished(runs))
-    run_if_needed(table, runs / "validation", num_episodes=EPISODES)
+    table = validation_table(finished(options.runs))
+    run_if_needed(table, options.runs / "validation", num_episodes=EPISODES)
 
 
 def validation_rows(papers: list[Path], path: Path) -> list[dict[str, Any]]:
@@ -209,7 +204,7 @@ def best_row(path: Path) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """The tables of experiments/results/laptop/main_job.md."""
+    """The tables of experiments/results/main_job/main_job.md."""
     lines = [
         "| search seed | cost of each stage | fall (95 %) | control's last stage "
         "| return of each stage | share of the reference's | falls, below control, "
@@ -333,8 +328,9 @@ def require_same_job(paths: list[Path]) -> None:
             raise SystemExit(f"{path} is not a run of the job of {paths[0]}")
 
 
-def collect(runs: Path, results: Path) -> None:
+def collect(options: Options) -> None:
     """JSON, table and figure of all runs."""
+    runs, results = options.runs, options.results
     papers = finished(runs)
     seeds = [read_config(path)[0].seed for path in papers]
     controls = [search_dir(runs, "random", seed) for seed in seeds]
@@ -358,22 +354,7 @@ def collect(runs: Path, results: Path) -> None:
     figure(result, runs, results / "main_job.png")
 
 
-def main() -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=("run", "validate", "collect"))
-    parser.add_argument("--runs", type=Path, default=Path("runs/main_job"))
-    parser.add_argument(
-        "--results", type=Path, default=Path("experiments/results/laptop")
-    )
-    args, flags = parser.parse_known_args()
-    if args.part == "run":
-        run(args.runs, flags)
-    elif args.part == "validate":
-        validate(args.runs)
-    else:
-        collect(args.runs, args.results)
-
+PARTS = {"run": run, "validate": validate, "collect": collect}
 
 if __name__ == "__main__":
-    main()
+    run_part("main_job", __doc__, PARTS, ())

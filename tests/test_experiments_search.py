@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from autocost_jax.config import preset
+from autocost_jax.config import AgentConfig, preset
 from autocost_jax.costs import load_cost
 from autocost_jax.envs.physics.models import FLOOR_CONTACTS
 from autocost_jax.runs.directory import RunDir
@@ -20,7 +20,7 @@ RESULTS = Path(__file__).parents[1] / "experiments" / "results"
 @pytest.mark.parametrize(
     ("script", "folder", "rows"),
     [
-        ("main_job", "laptop", None),
+        ("main_job", "main_job", None),
         ("fitness", "fitness", "rules"),
         ("learners", "learners", "settings"),
         ("starts", "starts", None),
@@ -43,7 +43,7 @@ def test_measured_learners_are_those_of_the_script():
     for measured in result["settings"]:
         train = learners.config_of(measured["setting"]).train
         agent = dataclasses.asdict(train.agent)
-        known = {name: measured["agent"][name] for name in agent}
+        known = dataclasses.asdict(AgentConfig()) | measured["agent"]
         assert known == json.loads(json.dumps(agent))
         assert measured["worlds"] == train.num_worlds
 
