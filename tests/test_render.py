@@ -28,6 +28,7 @@ from pages import browse, check_page
 from test_scene import still_recording
 
 STEPS = 60
+SOLID = ["Push-Pillar-Car", "DoggoPush2", "PointGoal2"]  # worlds of all kinds of solids
 RENDER = ["render", "--steps", str(STEPS)]
 
 SCRIPT = (Path(__file__).parent / "data" / "use_replay.js").read_text()
@@ -92,6 +93,7 @@ def test_the_page_can_be_used(replayed, tmp_path):
     assert notes["bare"]["colours"] != notes["follow"]["colours"]
 
 
+@pytest.mark.slow
 def test_the_address_chooses_moment_and_view(replayed, tmp_path):
     dom, log = browse(tmp_path, replayed, address="#step=25&view=top")
     assert re.search(r'id="now-step">step 25 of 60<', dom)
@@ -99,6 +101,7 @@ def test_the_address_chooses_moment_and_view(replayed, tmp_path):
     assert "CONSOLE" not in log
 
 
+@pytest.mark.slow
 def test_a_page_by_itself_plays(replayed, tmp_path):
     for seconds in (4, 16, 64):  # on a busy machine the page is slow to begin
         budget = f"--virtual-time-budget={1000 * seconds}"
@@ -110,12 +113,25 @@ def test_a_page_by_itself_plays(replayed, tmp_path):
     pytest.fail(f"it stands at frame {frame.group(1)}")
 
 
-@pytest.mark.parametrize("name", ["Push-Pillar-Car", "DoggoPush2", "PointGoal2"])
-def test_every_kind_of_solid_can_be_drawn(name, tmp_path):
-    """The world stands still, so that nothing is compiled; its page must draw it."""
+def still_page(name):
+    """The page of a world that stands still, so that nothing is compiled."""
     config = env_config(name)
     replay = scene.make_replay(config, still_recording(config, STEPS))
-    notes = use(replay_page(name, {}, replay), tmp_path)
+    return replay, replay_page(name, {}, replay)
+
+
+@pytest.mark.parametrize("name", SOLID)
+def test_every_kind_of_solid_is_in_the_page(name):
+    replay, text = still_page(name)
+    check_page(text)
+    assert sum_of(text, "cost") == pytest.approx(replay.cost.sum())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SOLID)
+def test_every_kind_of_solid_can_be_drawn(name, tmp_path):
+    replay, text = still_page(name)
+    notes = use(text, tmp_path)
     assert min(note["colours"] for note in notes.values()) > 20
     assert notes["end"]["cost"] == pytest.approx(replay.cost.sum())
 

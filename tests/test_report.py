@@ -614,6 +614,7 @@ def test_a_fleeing_robot_is_followed_and_called_outside(tmp_path):
     assert "CONSOLE" not in log
 
 
+@pytest.mark.slow
 def test_browser_opens_a_report_without_replay(tmp_path):
     data = make_data(replays=(), stages=(), best=None)
     dom, log = browse(tmp_path, report.write_report(data, tmp_path / "index.html"))
@@ -621,6 +622,7 @@ def test_browser_opens_a_report_without_replay(tmp_path):
     assert "CONSOLE" not in log
 
 
+@pytest.mark.slow
 def test_browser_log_would_show_an_error(tmp_path):
     """The check above is not vacuous: a broken page does reach the log."""
     page = tmp_path / "broken.html"

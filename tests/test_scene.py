@@ -82,7 +82,8 @@ def test_at_rest_is_where_an_episode_starts(name):
 @pytest.fixture(scope="module")
 def episode():
     """Observations beside a recording of the same episode, and its configuration."""
-    config = dataclasses.replace(ENVS["Goal-Hazard-Point"], num_steps=NUM_STEPS)
+    world = ENVS["Goal-Hazard-Point"]
+    config = dataclasses.replace(world, num_steps=NUM_STEPS, physics="closed_form")
     env = make_env(config)
     agent = scripted_agent("seek", env)
 

@@ -1,12 +1,13 @@
 """The closed form of the Point: the same world as in MJX, number for number."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env_data import NUM_WORLDS, blank_layout, compile_env, states_at
+from env_data import NUM_WORLDS, Compiled, blank_layout, compile_env, states_at
 
 from autocost_jax.config import EnvConfig, env_config
 from autocost_jax.envs.env import make_env
@@ -40,7 +41,15 @@ def stepped(make, config: EnvConfig):
         return jax.device_get(step(qpos, qvel, action))
 
 
-@pytest.mark.parametrize(("substeps", "bound"), [(1, SUBSTEP), (10, STEP)])
+@functools.cache
+def compiled() -> Compiled:
+    return compile_env(CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("substeps", "bound"),
+    [(1, SUBSTEP), pytest.param(10, STEP, marks=pytest.mark.slow)],
+)
 def test_equals_mjx_to_rounding(substeps, bound):
     """Every field of the physics, and every sensor."""
     config = dataclasses.replace(CONFIG, frameskip_binom_n=substeps)
@@ -56,7 +65,7 @@ def test_equals_mjx_to_rounding(substeps, bound):
 
 def test_is_the_same_environment(default_env, worlds):
     """A step of every field of the state, in float32; also where goals are met."""
-    env = compile_env(CONFIG)
+    env = compiled()
     reset = env.reset(jax.random.split(jax.random.key(0), NUM_WORLDS))
     goals = worlds.layout.goal_xy
     action = np.tile([1.0, 1.0], (NUM_WORLDS, 1))  # the servo saturates: no chatter
@@ -79,7 +88,7 @@ def test_is_the_same_environment(default_env, worlds):
 
 def test_steps_match_the_record(free_point):
     """The same bars as MJX: positions, and yaw rates up to the servo's chatter."""
-    env = compile_env(CONFIG)
+    env = compiled()
     layout = blank_layout(CONFIG)
     qpos, qvel = free_point["qpos"], free_point["qvel"]
     after = env.step(
@@ -94,7 +103,7 @@ def test_steps_match_the_record(free_point):
 def test_turns_as_fast_as_the_fact_sheet_says():
     """Mean yaw rate of the chattering servo, for some constant actions."""
     expected = {0.05: 0.0, 0.2: 0.495, 0.5: 1.350, 0.8: 2.438, 1.0: 2.998}
-    env = compile_env(CONFIG)
+    env = compiled()
     num_steps, skipped = 200, 50
     turns = np.resize(list(expected), NUM_WORLDS)
     action = jnp.asarray(np.stack([np.zeros(NUM_WORLDS), turns], 1))

@@ -281,6 +281,7 @@ def car_errors(car: Recording, env: Env, after: EnvState) -> dict[str, np.ndarra
     }
 
 
+@pytest.mark.slow  # the Car's own steps: tests/envs/test_robots.py
 def test_car_steps_match(car_env, car, car_starts):
     env, step = car_env
     after = step(car_starts, jnp.asarray(car.actions, jnp.float32))
@@ -305,6 +306,7 @@ def test_car_steps_match(car_env, car, car_starts):
     assert_within(errors, bounds)
 
 
+@pytest.mark.slow
 def test_car_open_loop(car_env, car, car_starts):
     _, step = car_env
     errors = drift(step, car_starts, car, 41)[:, 1:]
