@@ -74,6 +74,29 @@ def test_update_keeps_types_and_is_finite_with_one_trace(problem):
     assert all(jax.tree.leaves(changed))
 
 
+@pytest.mark.parametrize("problem", [("cpo", "full")], indirect=True)
+def test_violation_factor_is_worth_a_lower_limit(problem):
+    """k (J_c - d) = J_c - d' with d' = k d - (k - 1) J_c; below the limit nothing."""
+    state, trajectory, cost, slot, key = problem.args
+    factor, measured = 2.0, cost.sum(1).mean(-1)
+    config = dataclasses.replace(FULL_BATCH, violation_factor=factor)
+    update = jax.jit(jax.vmap(cpo(config, SIZES).update))
+
+    def learn(update, limit):
+        limited = slot.replace(cost=slot.cost.replace(limit=limit))
+        new, metrics = update(state, trajectory, cost, limited, key)
+        return new.policy, metrics
+
+    above = 0.99 * measured
+    plain, strict = learn(problem.update, above), learn(update, above)
+    lower, _ = learn(problem.update, factor * above - (factor - 1) * measured)
+    chex.assert_trees_all_close(strict[0], lower, rtol=1e-4, atol=1e-5)
+    assert not np.allclose(plain[0]["log_std"], strict[0]["log_std"], atol=1e-4)
+    np.testing.assert_array_equal(plain[1]["violation"], strict[1]["violation"])
+    below = [learn(each, 1.1 * measured)[0] for each in (problem.update, update)]
+    chex.assert_trees_all_close(*below, rtol=1e-5, atol=1e-6)
+
+
 def test_a_nan_slot_harms_nobody(problem):
     state, trajectory, cost, slot, key = problem.args
     poisoned = trajectory.replace(
