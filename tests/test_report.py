@@ -23,6 +23,17 @@ HOSTILE = "<script>alert('x')</script>\" & {{script}} $a$ </title>"
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 
 
+DRAWN = ("self_contained", "diverge", "obstacle", "escaped", "figures", "browser")
+
+
+@pytest.fixture(autouse=True)
+def bare_figures(request, monkeypatch):
+    """What is said is tested without the figures, which take seconds to draw."""
+    if not any(word in request.node.name for word in DRAWN):
+        bare = "<svg></svg>"
+        monkeypatch.setattr("autocost_jax.viz.svg.panel_svg", lambda *_, **__: bare)
+
+
 def golden_theta():
     return 0.6 * (((7 * np.arange(41) + 3) % 11) - 5.0)
 
