@@ -69,6 +69,8 @@ def script_player(env: str, policy: str) -> Player:
       ValueError: the world is unknown, or the policy for its robot.
     """
     config = env_config(env)
+    if config.has_closed_form:  # the same numbers, sooner
+        config = dataclasses.replace(config, physics="closed_form")
     scripted_agent(policy, make_env(config))  # refuses a bad name
 
     def make_agent(world: Env) -> tuple[Agent, Any]:
