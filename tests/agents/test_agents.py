@@ -1,6 +1,7 @@
 """One contract for every algorithm, and probes whose answers are known."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import chex
@@ -165,7 +166,7 @@ def test_one_slot_alone_and_an_invalid_world_is_as_good_as_none(make_agent):
 
 def test_policy_samples_unless_told_otherwise(make_agent):
     agent = make_agent(SMALL, Sizes())
-    state = agent.init(jax.random.key(0))
+    state = jax.jit(agent.init)(jax.random.key(0))
     obs = jnp.ones((5000, 3))
     action = agent.policy(state, obs, jax.random.key(1))
     mean = agent.policy(state, obs, jax.random.key(1), deterministic=True)
@@ -193,7 +194,7 @@ def test_critics_learn_the_discounted_sum_to_the_bootstrap(make_agent):
     config = dataclasses.replace(LONG_CRITICS, gamma=0.5, cost_gamma=0.25)
     sizes = Sizes(observation_size=1, action_size=1, episode_length=10)
     agent = make_agent(config, sizes)
-    state = agent.init(jax.random.key(0))
+    state = jax.jit(agent.init)(jax.random.key(0))
     where = jnp.arange(11) % 2
     obs = jnp.broadcast_to(where[:, None, None], (11, 4, 1)).astype(float)
     action = agent.policy(state, obs[:-1], jax.random.key(1))
@@ -212,16 +213,22 @@ def test_critics_learn_the_discounted_sum_to_the_bootstrap(make_agent):
     assert metrics["j_c"] == pytest.approx(10.0)
 
 
-def run_bandit(agent, steps, limit, constrained=1.0, coefficients=(1.0, 1.0)):
+@functools.cache
+def probe(make):
+    """An agent of `PROBE`, initial state, jitted `act` and update, for all probes."""
+    agent = make(PROBE, SIZES)
+    play = jax.jit(lambda state, key: act(agent, state, key, SIZES, num_worlds=32))
+    return agent, jax.jit(agent.init)(jax.random.key(0)), play, jax.jit(agent.update)
+
+
+def run_bandit(make, steps, limit, constrained=1.0, coefficients=(1.0, 1.0)):
     """Mean action after `steps` updates: reward = action 0, cost = max(action 1, 0)."""
-    sizes = Sizes()
-    state = agent.init(jax.random.key(0))
-    update = jax.jit(agent.update)
+    agent, state, play, update = probe(make)
     metrics = []
     start = agent.policy(state, jnp.full((3,), 0.5), None, deterministic=True)
     for i in range(steps):
         key_act, key_update = jax.random.split(jax.random.key(i))
-        obs, action = act(agent, state, key_act, sizes, num_worlds=32)
+        obs, action = play(state, key_act)
         trajectory = make_trajectory(obs, action, coefficients[0] * action[..., 0])
         cost = coefficients[1] * jnp.maximum(action[..., 1], 0.0)
         slot = make_slot(limit, constrained)
@@ -237,30 +244,27 @@ PROBE = dataclasses.replace(
 
 
 def test_reward_gradient_raises_the_rewarded_action(make_agent):
-    moved, _ = run_bandit(make_agent(PROBE, Sizes()), 12, 1e3, constrained=0.0)
+    moved, _ = run_bandit(make_agent, 12, 1e3, constrained=0.0)
     assert moved[0] > 0.5
 
 
 def test_cost_gradient_lowers_the_costly_action(make_agent):
-    moved, metrics = run_bandit(
-        make_agent(PROBE, Sizes()), 12, 0.0, coefficients=(0.0, 1.0)
-    )
+    moved, metrics = run_bandit(make_agent, 12, 0.0, coefficients=(0.0, 1.0))
     assert moved[1] < -0.2
     assert metrics[-1]["j_c"] < 0.7 * metrics[0]["j_c"]
     assert metrics[0]["multiplier"] > 0
 
 
 def test_ppo_ignores_cost_where_ppo_lagrangian_does_not():
-    agent = ppo_lagrangian(PROBE, Sizes())
-    free, _ = run_bandit(agent, 8, 0.0, 0.0, coefficients=(0.0, 1.0))
-    held, _ = run_bandit(agent, 8, 0.0, 1.0, coefficients=(0.0, 1.0))
+    free, _ = run_bandit(ppo_lagrangian, 8, 0.0, 0.0, coefficients=(0.0, 1.0))
+    held, _ = run_bandit(ppo_lagrangian, 8, 0.0, 1.0, coefficients=(0.0, 1.0))
     assert abs(free[1]) < 0.1
     assert held[1] < -0.15
 
 
 def test_cpo_recovers_within_its_bounds():
     """Infeasible from the start: recovery steps, accepted, inside KL and cost."""
-    _, metrics = run_bandit(cpo(PROBE, Sizes()), 10, 0.5)
+    _, metrics = run_bandit(cpo, 10, 0.5)
     for m in metrics:
         assert m["kl"] <= PROBE.target_kl
         if m["accepted"]:

@@ -22,7 +22,7 @@ def size(tree):
 @pytest.fixture(scope="module")
 def nets():
     networks = make_networks(AgentConfig(), 28, 2)
-    return networks, *networks.init(jax.random.key(0))
+    return networks, *jax.jit(networks.init)(jax.random.key(0))
 
 
 def test_parameter_counts(nets):
@@ -97,7 +97,7 @@ def test_sampled_actions_have_the_policy_s_moments():
 def test_critics_of_a_lower_precision_stay_close(precision):
     config = AgentConfig(hidden_sizes=(64, 64), critic_precision=precision)
     networks = make_networks(config, 36, 2)
-    _, critic = networks.init(jax.random.key(0))
+    _, critic = jax.jit(networks.init)(jax.random.key(0))
     obs = jax.random.normal(jax.random.key(1), (100, 36))
     exact, rough = networks.values(critic, obs), networks.values(critic, obs, precision)
     assert rough.dtype == exact.dtype
@@ -114,7 +114,7 @@ def test_the_critics_own_steps_use_the_precision(precision, expect):
     """Forward and backward products of the hidden layers, by what is compiled."""
     config = AgentConfig(hidden_sizes=(8,), critic_precision=precision)
     networks = make_networks(config, 5, 2)
-    _, critic = networks.init(jax.random.key(0))
+    _, critic = jax.jit(networks.init)(jax.random.key(0))
 
     def loss(critic, obs):
         with jax.default_matmul_precision("highest"):
@@ -131,7 +131,7 @@ def test_the_critics_own_steps_use_the_precision(precision, expect):
 def test_acting_and_judging_use_full_precision():
     """Also outside an update, where a GPU would round products by itself."""
     networks = make_networks(AgentConfig(hidden_sizes=(8,)), 5, 2)
-    policy, critic = networks.init(jax.random.key(0))
+    policy, critic = jax.jit(networks.init)(jax.random.key(0))
     for fn, params in ((networks.distribution, policy), (networks.values, critic)):
         text = jax.jit(fn).lower(params, jnp.ones((7, 5))).as_text()
         products = [line for line in text.splitlines() if "dot_general" in line]

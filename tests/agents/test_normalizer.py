@@ -58,7 +58,7 @@ def test_before_the_first_update_observations_pass():
 def test_an_agent_learns_its_normalizer(make, key):
     config = dataclasses.replace(SMALL, normalize_obs=True)
     agent, plain = make(config, SIZES), make(SMALL, SIZES)
-    state = agent.init(key)
+    state = jax.jit(agent.init)(key)
     obs, action = act(agent, state, key)
     trajectory = make_trajectory(obs, action, action[..., 0])
     cost = jnp.zeros_like(trajectory.reward)

@@ -138,7 +138,7 @@ def test_loss_without_multiplier_is_exactly_ppo_s():
 
 def test_plain_ppo_ignores_cost_bit_for_bit():
     agent = ppo_lagrangian(SMALL, Sizes())
-    state = agent.init(jax.random.key(0))
+    state = jax.jit(agent.init)(jax.random.key(0))
     obs, action = act(agent, state, jax.random.key(1))
     trajectory = make_trajectory(obs, action, action[..., 0])
     update = jax.jit(agent.update)
@@ -151,7 +151,7 @@ def test_plain_ppo_ignores_cost_bit_for_bit():
     assert ends[1][1]["cost_weight"] == 0
 
 
-@pytest.mark.parametrize("minibatches", [1, 4])
+@pytest.mark.parametrize("minibatches", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_kl_stop_takes_whole_passes_and_then_none(minibatches):
     """A step far beyond the trust region ends the update after one pass."""
     config = AgentConfig(
@@ -162,7 +162,7 @@ def test_kl_stop_takes_whole_passes_and_then_none(minibatches):
         value_passes=1,
     )
     agent = ppo_lagrangian(config, Sizes())
-    state = agent.init(jax.random.key(0))
+    state = jax.jit(agent.init)(jax.random.key(0))
     obs, action = act(agent, state, jax.random.key(1))
     trajectory = make_trajectory(obs, action, action[..., 0])
     cost = jnp.zeros_like(trajectory.reward)

@@ -90,7 +90,7 @@ def test_conjugate_gradient_stays_finite(H):
 
 def network_problem():
     networks = make_networks(AgentConfig(hidden_sizes=(6, 5)), 4, 3)
-    params, _ = networks.init(jax.random.key(1))
+    params, _ = jax.jit(networks.init)(jax.random.key(1))
     params["log_std"] = jnp.array([-0.5, 0.2, -1.0])
     theta, unravel = ravel_pytree(params)
     obs = jax.random.normal(jax.random.key(2), (12, 4))
@@ -141,7 +141,7 @@ def test_factored_fisher_product_equals_the_generic_one(
     monkeypatch.setattr(fisher, "num_row_blocks", lambda rows: blocks)
     with jax.enable_x64(True):
         networks = make_networks(AgentConfig(hidden_sizes=hidden_sizes), 4, 3)
-        params, _ = networks.init(jax.random.key(1))
+        params, _ = jax.jit(networks.init)(jax.random.key(1))
         params["log_std"] = jnp.array([-0.5, 0.2, -1.0])
         theta, unravel = ravel_pytree(params)
         obs = jax.random.normal(jax.random.key(2), (12, 4))
