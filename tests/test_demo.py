@@ -6,6 +6,8 @@ import pytest
 from autocost_jax import cost_card
 from autocost_jax.viz.demo import FOUND, write_demo
 
+pytestmark = pytest.mark.optimised
+
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):

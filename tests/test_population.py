@@ -364,6 +364,7 @@ def test_in_the_last_turn_fewer_slots_learn():
         np.testing.assert_allclose(one, all_, rtol=ONE_UPDATE, atol=ONE_UPDATE)
 
 
+@pytest.mark.slow
 def test_slots_that_learn_in_turns_need_less_memory():
     env = make_toy_env()
 

@@ -213,7 +213,7 @@ def test_the_speeds_of_the_readme_are_measured_ones():
 
 
 def test_the_results_of_the_readme_are_those_of_the_main_job():
-    file = ROOT / "experiments" / "results" / "laptop" / "main_job.json"
+    file = ROOT / "experiments" / "results" / "main_job" / "main_job.json"
     result = json.loads(file.read_text())
     for seed, best in zip(result["seeds"], result["best"], strict=True):
         cells = [

@@ -440,10 +440,12 @@ def check_push_steps(name: str, physics: str = "reduced") -> None:
     assert error[:, -7:-5].max() < BOX_PLACE
 
 
+@pytest.mark.slow
 def test_single_steps_of_a_point_at_the_box():
     check_push_steps("Push-Hazard-Point")
 
 
+@pytest.mark.slow
 def test_point_meets_the_box_when_the_scene_does():
     """Straight, offset, rotated and far boxes, until five steps after the contact."""
     world = compiled("Push-Hazard-Point")
@@ -475,6 +477,7 @@ def test_point_meets_the_box_when_the_scene_does():
         np.testing.assert_allclose(a, b, atol=0.1)
 
 
+@pytest.mark.slow
 def test_box_is_pushed_as_recorded_until_shortly_after_contact():
     recorded = load("push_point_straight")
     config = env_config("Push-Hazard-Point")

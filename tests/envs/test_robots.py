@@ -76,7 +76,11 @@ def test_the_scene_in_c_repeats_the_record(robot):
         np.testing.assert_allclose(data.qpos, expected, atol=OPEN_LOOP_C)
 
 
-@pytest.mark.parametrize("robot", ["Car", "Doggo"])
+# The Doggo's dynamics take a minute to compile; its rows are in test_rows.py.
+DOGGO = pytest.param("Doggo", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("robot", ["Car", DOGGO])
 def test_control_steps_from_recorded_states(robot):
     """One control step from each of 200 recorded states: velocities and sensors."""
     recorded = load(f"free_{robot.lower()}_smooth")
@@ -109,7 +113,7 @@ def extreme_actions(kind: str, size: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["ahead", "back", "bang-bang"])
-@pytest.mark.parametrize("robot", ["Point", "Car", "Doggo"])
+@pytest.mark.parametrize("robot", ["Point", "Car", DOGGO])
 def test_control_steps_under_extreme_actions(robot, kind):
     """A control step of MJX from each state of a run of the scene in C.
 
