@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -63,7 +64,7 @@ jit_mutate = jax.jit(mutate, static_argnums=2)
 
 
 @functools.partial(jax.jit, static_argnames="network")
-def graded(key, places, quiet_places, loud_costs, network="lidar_mlp"):
+def graded(key, places, quiet_places, loud_costs, network: Any = "lidar_mlp"):
     """200 costs of the graded start, and what they say of the places [200, M]."""
     theta = graded_start(key, 200, 8.0, places, network, quiet_places, loud_costs)
     return theta, jax.vmap(lambda theta: intrinsic_cost(theta, places))(theta)

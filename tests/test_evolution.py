@@ -467,8 +467,8 @@ def test_each_place_may_have_its_own_seeds_in_all_stages(key):
     rest = np.setdiff1d(np.arange(24), own)
     np.testing.assert_array_equal(later[rest], keys_of(shared, 1, candidates)[rest])
     assert not (first[rest] == later[rest]).all(-1).any()
-    final = (keys_of(c, 2, candidates, is_final=True) for c in (config, shared))
-    np.testing.assert_array_equal(*final)
+    own, common = (keys_of(c, 2, candidates, is_final=True) for c in (config, shared))
+    np.testing.assert_array_equal(own, common)
 
 
 FINALS = dataclasses.replace(
