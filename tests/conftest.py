@@ -67,12 +67,14 @@ def compilation_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def optimisation(request: pytest.FixtureRequest) -> None:
-    """Programs of tests run once or twice: to compile them takes the time.
+    """Programs of fast tests run once or twice: to compile them takes the time.
 
-    So it is done without optimisations, which halves it; a module whose programs run
-    for longer says `pytestmark = pytest.mark.optimised`.
+    So it is done without optimisations, which halves it. A module whose programs run
+    for longer says `pytestmark = pytest.mark.optimised`; slow tests compile as users
+    do.
     """
-    optimised = request.node.get_closest_marker("optimised") is not None
+    is_fast = "not slow" in request.config.getoption("markexpr")
+    optimised = not is_fast or request.node.get_closest_marker("optimised") is not None
     jax.config.update("jax_disable_most_optimizations", not optimised)
 
 

@@ -23,13 +23,15 @@ HOSTILE = "<script>alert('x')</script>\" & {{script}} $a$ </title>"
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 
 
-DRAWN = ("self_contained", "diverge", "obstacle", "escaped", "figures", "browser")
+@pytest.fixture
+def drawn():
+    """For tests that look at the figures, too, or at what the page must not say."""
 
 
 @pytest.fixture(autouse=True)
 def bare_figures(request, monkeypatch):
-    """What is said is tested without the figures, which take seconds to draw."""
-    if not any(word in request.node.name for word in DRAWN):
+    """What a page says is tested without its figures, which take seconds to draw."""
+    if "drawn" not in request.fixturenames:
         bare = "<svg></svg>"
         monkeypatch.setattr("autocost_jax.viz.svg.panel_svg", lambda *_, **__: bare)
 
@@ -216,6 +218,7 @@ def test_lidar_turns_with_the_robot():
         np.testing.assert_allclose(lidar[turn], np.roll(lidar[0], turn), atol=1e-6)
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize(
     "changes",
     [
@@ -236,6 +239,7 @@ def test_page_is_self_contained(changes):
     assert not re.search(r"\b(nan|NaN|inf|Infinity)\b", shown)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_all_candidates_may_diverge():
     stage = make_stage(np.random.default_rng(1), 3, 2.0, frozen=(0, 1, 2))
     data = make_data(stages=(stage, stage), best=None, conclusion="")
@@ -243,6 +247,7 @@ def test_all_candidates_may_diverge():
     assert "Every candidate of a stage diverged" in report.verdict(data)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_non_finite_replay_stays_strict_json():
     recording = make_recording(50)
     recording.qpos[12:], recording.reward[4] = np.nan, np.inf
@@ -251,6 +256,7 @@ def test_non_finite_replay_stays_strict_json():
     check_page(report.render_report(make_data(replays=(replay,))))
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_obstacle_has_its_name():
     text = report.render_report(make_data(obstacle="pillar", replays=()))
     assert "single pillar" in text
@@ -258,6 +264,7 @@ def test_the_obstacle_has_its_name():
     assert "hazard" not in text.split("<style>")[0] + text.split("</style>")[1]
 
 
+@pytest.mark.usefixtures("drawn")
 def test_text_is_escaped():
     data = make_data(
         title=HOSTILE, config={HOSTILE: HOSTILE, "duration": HOSTILE},
@@ -303,6 +310,7 @@ def rows_of(page, section):
     ]
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_page_begins_with_the_outcome():
     page = report.render_report(make_data())
     order = ("outcome", "tradeoff", "replay", "best", "evolution", "learning")
@@ -339,6 +347,7 @@ def test_unknown_scores_are_dashes():
     ]  # fmt: skip
 
 
+@pytest.mark.usefixtures("drawn")
 def test_without_fresh_scores_the_page_claims_no_success():
     data = make_data(conclusion="", summary=())
     text = report.verdict(data)
@@ -348,6 +357,7 @@ def test_without_fresh_scores_the_page_claims_no_success():
     assert 'id="outcome"' not in report.render_report(data)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_short_episodes_say_nothing_about_safety():
     page = report.render_report(make_data(can_violate=False, conclusion=""))
     shown = page.split("</style>")[1].split("<footer")[0]
@@ -374,6 +384,7 @@ def test_people_count_candidates_from_one():
     assert names == [f"{s} / {i}" for s in range(1, 5) for i in range(1, 9)]
 
 
+@pytest.mark.usefixtures("drawn")
 def test_nobody_is_called_timid():
     assert "timid" not in report.render_report(make_data()).lower()
 
@@ -491,6 +502,7 @@ def test_a_comparison_needs_two_episodes(tmp_path):
     assert not path.exists()
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_comparison_is_one_page(tmp_path):
     lengths = {"a": 50, "b": 100}
     pair = [make_replay(steep_theta(), n, label) for label, n in lengths.items()]
@@ -545,6 +557,7 @@ def test_wrong_shapes_are_refused():
         dataclasses.replace(make_replay(steep_theta(), 50), reward=np.zeros(3))
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.slow
 def test_paper_sized_report_is_small_and_repeatable(tmp_path):
     rng = np.random.default_rng(2)
@@ -582,6 +595,7 @@ def frame_of(dom, pane=0):
     return int(found.group(1))
 
 
+@pytest.mark.usefixtures("drawn")
 def test_browser_plays_the_replay(tmp_path):
     page = report.write_report(make_data(title=HOSTILE), tmp_path / "index.html")
     dom, log = browse(tmp_path, page)
@@ -592,6 +606,7 @@ def test_browser_plays_the_replay(tmp_path):
     assert "ERR_" not in log
 
 
+@pytest.mark.usefixtures("drawn")
 def test_one_slider_moves_two_replays(tmp_path):
     """The shorter episode waits at its end; both say where they are."""
     pair = [
@@ -607,6 +622,7 @@ def test_one_slider_moves_two_replays(tmp_path):
     assert "CONSOLE" not in log
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_fleeing_robot_is_followed_and_called_outside(tmp_path):
     recording = make_recording(50)
     recording.qpos[:, 0] += np.linspace(0, 25, 51)
@@ -625,6 +641,7 @@ def test_a_fleeing_robot_is_followed_and_called_outside(tmp_path):
     assert "CONSOLE" not in log
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.slow
 def test_browser_opens_a_report_without_replay(tmp_path):
     data = make_data(replays=(), stages=(), best=None)
@@ -633,6 +650,7 @@ def test_browser_opens_a_report_without_replay(tmp_path):
     assert "CONSOLE" not in log
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.slow
 def test_browser_log_would_show_an_error(tmp_path):
     """The check above is not vacuous: a broken page does reach the log."""
