@@ -370,9 +370,8 @@ def test_slots_that_learn_in_turns_need_less_memory():
 
     def workspace(chunk):
         config = train_config(population_chunk=chunk)
-        agents = make_agents(ALGORITHMS[:1], config, env)
-        population = make_population(env, agents, config)
-        slots = groups(MORE)[:1]
+        population = make_population(env, make_agents(ALGORITHMS, config, env), config)
+        slots = groups(MORE)
         compiled = population.compile(population.init(slots), slots)
         return compiled.memory_analysis().temp_size_in_bytes
 

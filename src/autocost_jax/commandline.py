@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from autocost_jax.config import EnvConfig, SearchConfig, TrainConfig, env_config
-from autocost_jax.config.checks import field_types, help_texts
+from autocost_jax.config.checks import all_fields
 
 T = TypeVar("T")
 C = TypeVar("C", SearchConfig, TrainConfig)
@@ -52,10 +52,11 @@ def with_flags(options: type, config: type, names: Sequence[str]) -> Any:
     """
     import tyro
 
-    hints, texts = field_types(config), help_texts(config)
-    fields = [
-        (name, Annotated[hints[name] | None, tyro.conf.arg(help=texts[name])], None)
-        for name in names
+    known = all_fields(config)
+    flags = [(name, known[name].type, known[name].metadata["help"]) for name in names]
+    fields: list[Any] = [
+        (name, Annotated[kind | None, tyro.conf.arg(help=text)], None)
+        for name, kind, text in flags
     ]
     doc = {"__doc__": options.__doc__}
     return dataclasses.make_dataclass(

@@ -58,21 +58,6 @@ def act(agent, state, key, sizes=SIZES, num_worlds=8):
     return obs, agent.policy(state, obs[:-1], key_act)
 
 
-def stack_problem(agent, num_slots=4):
-    """Stacked (state, trajectory, cost, slot, key) of different random slots."""
-
-    def one(key, limit):
-        key_init, key_act, key_update = jax.random.split(key, 3)
-        state = agent.init(key_init)
-        obs, action = act(agent, state, key_act)
-        trajectory = make_trajectory(obs, action, action[..., 0])
-        cost = jnp.maximum(action[..., 1], 0.0)
-        return state, trajectory, cost, make_slot(limit), key_update
-
-    keys = jax.random.split(jax.random.key(0), num_slots)
-    return jax.jit(jax.vmap(one))(keys, jnp.arange(num_slots, dtype=jnp.float32))
-
-
 def fisher_product(distribution, theta, weight, damping):
     """(F + damping I) z of any policy, by derivatives: an oracle for the factored one.
 

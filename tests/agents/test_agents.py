@@ -9,16 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from agent_toys import (
-    FULL_BATCH,
-    SIZES,
-    SMALL,
-    Sizes,
-    act,
-    make_slot,
-    make_trajectory,
-    stack_problem,
-)
+from agent_toys import FULL_BATCH, SIZES, SMALL, Sizes, act, make_slot, make_trajectory
 
 from autocost_jax.agents import Agent, cpo, ppo_lagrangian
 from autocost_jax.agents.networks import make_networks
@@ -57,6 +48,21 @@ def pick(tree, lane):
 
 def types(tree):
     return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type), tree)
+
+
+def stack_problem(agent, num_slots=4):
+    """Stacked (state, trajectory, cost, slot, key) of different random slots."""
+
+    def one(key, limit):
+        key_init, key_act, key_update = jax.random.split(key, 3)
+        state = agent.init(key_init)
+        obs, action = act(agent, state, key_act)
+        trajectory = make_trajectory(obs, action, action[..., 0])
+        cost = jnp.maximum(action[..., 1], 0.0)
+        return state, trajectory, cost, make_slot(limit), key_update
+
+    keys = jax.random.split(jax.random.key(0), num_slots)
+    return jax.jit(jax.vmap(one))(keys, jnp.arange(num_slots, dtype=jnp.float32))
 
 
 def test_update_keeps_types_and_is_finite_with_one_trace(problem):

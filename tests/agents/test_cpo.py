@@ -9,8 +9,7 @@ from agent_toys import fisher_product
 
 from autocost_jax.agents.advantages import centre, normalise
 from autocost_jax.agents.base import Batch
-from autocost_jax.agents.cpo import cpo_step, surrogates
-from autocost_jax.agents.cpo import update_policy as update_with
+from autocost_jax.agents.cpo import cpo_step, surrogates, update_policy
 from autocost_jax.agents.networks import log_prob
 from autocost_jax.agents.trust_region import conjugate_gradient
 from autocost_jax.config import AgentConfig
@@ -293,16 +292,13 @@ def bandit(num_dead=0):
     return batch, distribution
 
 
-def update_policy(config, distribution, theta, batch, c):
-    product = fisher_product(distribution, theta, batch.weight, config.cg_damping)
-    return update_with(config, distribution, theta, batch, c, product)
-
-
 @functools.partial(jax.jit, static_argnames="num_dead")
 def bandit_step(theta, batch, c, num_dead=0):
     """`update_policy` of the bandit, one program for all goldens."""
     _, distribution = bandit(num_dead)
-    return update_policy(AgentConfig(), distribution, theta, batch, c)
+    config = AgentConfig()
+    product = fisher_product(distribution, theta, batch.weight, config.cg_damping)
+    return update_policy(config, distribution, theta, batch, c, product)
 
 
 GOLDEN = [

@@ -204,8 +204,7 @@ def cpo(config: AgentConfig, env: EnvSizes) -> Agent:
     """Constrained policy optimisation: one full-batch trust-region step an epoch.
 
     Where agents cost more than their limit, the step is made to remove
-    `violation_factor` times the excess: 1 is the published algorithm, whose linear
-    model promises more than a step keeps.
+    `violation_factor` times the excess; 1 is the published algorithm.
 
     Args:
       config: hyper-parameters; the policy's passes and minibatches are not used.

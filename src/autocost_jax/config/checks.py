@@ -99,8 +99,3 @@ def all_fields(kind: Any) -> dict[str, dataclasses.Field[Any]]:
 def help_texts(kind: Any) -> dict[str, str]:
     """What each setting of a configuration class is for, nested ones included."""
     return {name: field.metadata["help"] for name, field in all_fields(kind).items()}
-
-
-def field_types(kind: Any) -> dict[str, Any]:
-    """The type of each setting of a configuration class, nested ones included."""
-    return {name: field.type for name, field in all_fields(kind).items()}

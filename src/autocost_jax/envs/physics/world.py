@@ -251,8 +251,8 @@ def _steps_in_one_loop(
     """The state after some physics steps with contacts, as a CPU likes it.
 
     One more round of the loop evaluates the state at its end, so that the dynamics are
-    compiled once, not twice: a third less to compile, at the same speed. A GPU would
-    have to be asked in each round whether it is the last.
+    compiled once, not twice. A GPU would have to be asked in each round whether it is
+    the last.
     """
     shapes = jax.eval_shape(lambda: _observe(scene, start, moving, time))
     unseen = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
