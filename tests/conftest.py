@@ -73,7 +73,7 @@ def optimisation(request: pytest.FixtureRequest) -> None:
     for longer says `pytestmark = pytest.mark.optimised`; slow tests compile as users
     do.
     """
-    is_fast = "not slow" in request.config.getoption("markexpr")
+    is_fast = "not slow" in str(request.config.getoption("markexpr"))
     optimised = not is_fast or request.node.get_closest_marker("optimised") is not None
     jax.config.update("jax_disable_most_optimizations", not optimised)
 
