@@ -46,6 +46,8 @@ SMALL: dict[str, Any] = {
 }
 MILD = SMALL | {"multiplier_init": 0.5, "multiplier_lr": 0.01}
 SHORT = MILD | {"gae_lambda": 0.95, "cost_gae_lambda": 0.95}
+STILL = SHORT | {"policy_output_scale": 0.01}
+STRICT = STILL | {"multiplier_lr": 0.02, "violation_factor": 1.5}
 # name -> worlds an epoch, segments per episode, agent settings that differ from REDUCED
 SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "as before": (8, 1, {}),
@@ -56,11 +58,8 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "32-32, multiplier from 1 at 0.02": (8, 1, SMALL | {"multiplier_lr": 0.02}),
     "32-32, multiplier from 0.5 at 0.01": (8, 1, MILD),
     "and lambda 0.95": (8, 1, SHORT),
-    "CPO removes 1.2 x its violation": (  # the learner of the `laptop` preset
-        8,
-        1,
-        SHORT | {"violation_factor": 1.2},
-    ),
+    "and a policy that begins all but still": (8, 1, STILL),
+    "and a multiplier at 0.02, CPO's violation x 1.5": (8, 1, STRICT),  # of `laptop`
 }
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 

@@ -1,21 +1,22 @@
 """Which random costs are useful, and what a short training tells of them.
 
-    python experiments/starts.py run      # grids of costs, each one table of slots
+    python experiments/starts.py run      # a grid of costs, one table of slots
     python experiments/starts.py collect  # JSON and table
 
-A cost of `graded_start` is drawn by how loud it is where it begins to speak
-(`quiet_cost`), how far it reaches (the percentile of typical places at which it
-begins), how loud it is at the 85th percentile, and how steep its hidden units are. Here
-all four are set, not drawn. Each cost trains both algorithms with three seeds of the
-`laptop` preset's learner, beside the extrinsic cost alone and a margin of 3x.
+A cost of `graded_start` is drawn by how far it reaches (the percentile of typical
+places at which it begins to speak, at 0.01) and how loud it is at the 85th percentile.
+Here both are set, not drawn. Each cost trains both algorithms with three seeds of the
+`laptop` preset's learner, for as long as its finalists, beside the extrinsic cost alone
+and a margin of 3x.
 
 The second table asks what makes a stage's ranking mean something: the rank correlation
-(Spearman) of one seed's score after 40 or 48 epochs with the truth, which is how far
-the other two seeds are from success at the end. Its last rule gives each cost a seed of
-its own, drawn anew 200 times; the bars come from one more seed.
+(Spearman) of one seed's score after so many epochs with the truth, which is how far the
+other two seeds are from a search's aims at the end. Its last rule gives each cost a
+seed of its own, drawn anew 200 times; the reference is of one more.
 """
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -23,186 +24,146 @@ from typing import Any
 import jax
 import numpy as np
 from common import Options, compact, run_if_needed, run_part
-from learners import config_of
 
+from autocost_jax.config import TrainConfig, preset
 from autocost_jax.envs.env import make_env
 from autocost_jax.rollout import typical_lidars
 from autocost_jax.runs.config_files import read_metrics
 from autocost_jax.runs.directory import run_facts
 from autocost_jax.runs.sweep import Method, SweepConfig
 from autocost_jax.search.starts import graded_start
-from autocost_jax.search.success import shortfall
+from autocost_jax.search.success import is_success, shortfall
 
-LEARNER = "32-32, multiplier from 0.5 at 0.01"  # of experiments/learners.py
-EPOCHS, FITNESS, SEEDS = 80, 12, (0, 1, 2)
+SEEDS = (0, 1, 2)
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 METRICS = ("ep_return", "violating_worlds", "ep_cost")
-# name -> (quiet_cost, percentile at which it begins, cost at the 85th percentile, scale
-# of the hidden weights); a place in the list modulo KEYS gives a cost's random key
-GRIDS: dict[str, list[tuple[float, float, float, float]]] = {
-    "convex": [
-        (1e-4, reach, loud, 8.0)
-        for reach in (5.0, 20.0, 35.0, 50.0, 65.0, 78.0)
-        for loud in (0.02, 0.1, 0.4, 0.95)
-    ],
-    "straight": [
-        (quiet, reach, loud, 8.0)
-        for reach in (40.0, 60.0)
-        for loud in (0.15, 0.3, 0.6)
-        for quiet in (1e-3, 1e-2)
-    ],
-    "steep": [
-        (1e-2, reach, loud, scale)
-        for scale in (8.0, 16.0, 32.0)
-        for reach in (50.0, 62.0)
-        for loud in (0.3, 0.5)
-    ],
-}
-KEYS = {"convex": 24, "straight": 12, "steep": 4}
-STAGES = (40, 48)  # lengths of a stage that are compared
+REACHES = (45.0, 55.0, 65.0, 75.0)  # percentiles at which a cost begins
+LOUDNESS = (0.1, 0.25, 0.6)  # at the 85th percentile
+GRID = tuple(itertools.product(REACHES, LOUDNESS))
+PLAIN = ("extrinsic", "margin 3x")  # stand before the grid's costs
+STAGES = (24, 36, 48)  # lengths of a stage that are compared
 
 
-def table_of(name: str, smoke: bool = False) -> SweepConfig:
-    """The slots of one grid: the references, then its costs, with both algorithms."""
-    train = config_of(LEARNER).train
-    train = dataclasses.replace(train, num_epochs=EPOCHS)
-    grid = GRIDS[name]
+def laptop(smoke: bool) -> TrainConfig:
+    """The training of the preset's finalists."""
+    config = preset("laptop")
+    train = dataclasses.replace(config.train, num_epochs=config.final_epochs)
     if smoke:
         env = dataclasses.replace(train.env, num_steps=200)
         train = dataclasses.replace(train, env=env, num_worlds=2, num_epochs=2)
-        grid = grid[:2]
+    return train
+
+
+def table_of(smoke: bool = False) -> SweepConfig:
+    """The slots: the references, then the grid's costs, with both algorithms."""
+    train = laptop(smoke)
     lidars = typical_lidars(make_env(train.env), jax.random.key(0))
     rows: list[tuple[str, str, Any]] = [
-        ("extrinsic", "extrinsic", None),
-        ("margin 3x", "extrinsic+safety_margin_3x", None),
+        (PLAIN[0], "extrinsic", None),
+        (PLAIN[1], "extrinsic+safety_margin_3x", None),
     ]
-    for i, (quiet, reach, loud, scale) in enumerate(grid):
-        key = jax.random.key(1000 + i % KEYS[name])
+    for i, (reach, loud) in enumerate(GRID[:2] if smoke else GRID):
         theta = graded_start(
-            key, 1, scale, lidars,
-            quiet_places=(reach, reach), loud_costs=(loud, loud), quiet_cost=quiet,
+            jax.random.key(i), 1, preset("laptop").init_std, lidars,
+            quiet_places=(reach, reach), loud_costs=(loud, loud),
         )[0]  # fmt: skip
         values = tuple(map(float, theta))
-        rows.append((label_of(*grid[i]), "extrinsic+intrinsic", values))
+        rows.append((label_of(reach, loud), "extrinsic+intrinsic", values))
     methods = tuple(
         Method(f"{algorithm} {label}", algorithm, cost, 0.0, theta)
         for algorithm in ALGORITHMS
         for label, cost, theta in rows
     )
-    return SweepConfig(train=train, methods=methods, seeds=SEEDS[: 2 if smoke else 3])
+    return SweepConfig(train=train, methods=methods, seeds=SEEDS)
 
 
-def label_of(quiet: float, reach: float, loud: float, scale: float) -> str:
+def label_of(reach: float, loud: float) -> str:
     """What a cost is called in the table."""
-    return f"{quiet:g} at {reach:g}, {loud:g} at 85, scale {scale:g}"
+    return f"at {reach:g}, {loud:g} at 85"
 
 
 def run(options: Options) -> None:
-    """All grids."""
-    for name in options.only or GRIDS:
-        table = table_of(name, options.smoke)
-        run_if_needed(table, options.runs / name, num_episodes=100)
+    """The grid."""
+    run_if_needed(table_of(options.smoke), options.runs, num_episodes=100)
 
 
-def histories(path: Path, num_seeds: int) -> dict[str, np.ndarray]:
-    """`METRICS` of a grid's training, each [epochs, A, C, seeds]."""
+def histories(path: Path) -> dict[str, np.ndarray]:
+    """`METRICS` of the training, each [epochs, A, C, seeds]."""
     rows = read_metrics(path)
     return {
         metric: np.array([[row[f"{a}/{metric}"] for a in ALGORITHMS] for row in rows])
-        .reshape(len(rows), len(ALGORITHMS), -1, num_seeds)
+        .reshape(len(rows), len(ALGORITHMS), -1, len(SEEDS))
         for metric in METRICS
     }  # fmt: skip
 
 
-def last(values: np.ndarray, after: int, fitness: int = FITNESS) -> np.ndarray:
-    """Means [A, C, seeds] over the last epochs of so many."""
-    return values[max(0, after - fitness) : after].mean(0)
+def last(values: np.ndarray, after: int) -> np.ndarray:
+    """Means [A, C, seeds] over the preset's fitness epochs, the last of so many."""
+    return values[max(0, after - preset("laptop").fitness_epochs) : after].mean(0)
 
 
-def distance(
-    values: dict[str, np.ndarray], after: int, seeds: list[int], logs: bool = False
-) -> np.ndarray:
-    """[C - 2] how far the costs are from success.
-
-    With `logs` distances are counted in factors, else in shares as in `shortfall`.
-    """
+def distance(values: dict[str, np.ndarray], after: int, seeds: list[int]) -> np.ndarray:
+    """[C - 2] how far the costs are from what a search aims at."""
     ep_return = last(values["ep_return"], after)[..., seeds].mean(-1)
     rate = last(values["violating_worlds"], after)[..., seeds].mean(-1)
     costs = (rate[:, 2:], ep_return[:, 2:])
-    if not logs:
-        return np.asarray(shortfall(*costs, rate[:, 0], ep_return[:, 0]))
-    left = np.maximum(costs[0], 0.01) / rate[:, :1]
-    kept = np.maximum(costs[1] / ep_return[:, :1], 0.003)
-    far = np.maximum(np.log(left / 0.25), 0) + np.maximum(np.log(0.3 / kept), 0)
-    return far.sum(0)
+    return np.asarray(shortfall(*costs, rate[:, 0], ep_return[:, 0]))
 
 
 def rank_correlations(values: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """How well one seed's score in a stage ranks the costs, by rule and length."""
     from scipy.stats import spearmanr
 
-    end, num_seeds = len(values["ep_cost"]), values["ep_cost"].shape[-1]
+    end, seeds = len(values["ep_cost"]), range(len(SEEDS))
+    truths = np.stack(
+        [distance(values, end, [o for o in seeds if o != seed]) for seed in seeds]
+    )
+    costs = np.arange(truths.shape[1])
 
-    def of(score: Any, after: int) -> list[float]:
-        found = []
-        for seed in range(num_seeds):
-            others = [other for other in range(num_seeds) if other != seed]
-            truth = distance(values, end, others)
-            found.append(float(spearmanr(score(after, seed), truth)[0]))  # pyright: ignore
-        return found
+    def correlation(score: Any, truth: np.ndarray) -> float:
+        return float(spearmanr(score, truth)[0])  # pyright: ignore
+
+    def by_cost(after: int, seed: int) -> np.ndarray:
+        return last(values["ep_cost"], after)[:, 2:, seed].mean(0)
+
+    def by_distance(after: int, seed: int) -> np.ndarray:
+        return distance(values, after, [seed])
 
     def own_seeds(after: int, draws: int = 200) -> float:
         """Each cost with one seed of its own against the truth of the others."""
         rng, found = np.random.default_rng(0), []
-        seeds = range(num_seeds)
-        apart = [[other for other in seeds if other != seed] for seed in seeds]
-        truths = np.stack([distance(values, end, others) for others in apart])
-        costs = np.arange(truths.shape[1])
-        rate, ep_return = (
-            last(values[name], after) for name in ("violating_worlds", "ep_return")
-        )
+        names = ("violating_worlds", "ep_return")
+        rate, ep_return = (last(values[name], after) for name in names)
         for _ in range(draws):
-            mine, bars = (
-                rng.integers(num_seeds, size=len(costs)),
-                rng.integers(num_seeds),
-            )
+            mine = rng.integers(len(seeds), size=len(costs))
+            plain = rng.integers(len(seeds))
             score = shortfall(
                 rate[:, 2 + costs, mine], ep_return[:, 2 + costs, mine],
-                rate[:, 0, bars], ep_return[:, 0, bars],
+                rate[:, 0, plain], ep_return[:, 0, plain],
             )  # fmt: skip
-            found.append(spearmanr(score, truths[mine, costs])[0])  # pyright: ignore
+            found.append(correlation(score, truths[mine, costs]))
         return float(np.mean(found))
 
-    rules = {
-        "extrinsic cost": lambda after, seed: last(values["ep_cost"], after)[
-            :, 2:, seed
-        ].mean(0),
-        "success, in factors": lambda after, seed: distance(
-            values, after, [seed], logs=True
-        ),
-        "success, in shares": lambda after, seed: distance(values, after, [seed]),
-    }
+    shared = {"extrinsic cost": by_cost, "distance from the aims": by_distance}
     lengths = [after for after in STAGES if after < end]
+    found = [
+        (rule, after, [correlation(score(after, s), truths[s]) for s in seeds])
+        for rule, score in shared.items()
+        for after in lengths
+    ]
+    own = "distance, a seed for each cost"
+    found += [(own, after, [own_seeds(after)]) for after in lengths]
     return [
-        {"rule": rule, "epochs": after, "by_seed": of(score, after)}
-        for rule, score in rules.items()
-        for after in lengths
-    ] + [
-        {
-            "rule": "success, in shares, a seed for each cost",
-            "epochs": after,
-            "by_seed": [own_seeds(after)],
-        }
-        for after in lengths
+        {"rule": rule, "epochs": after, "by_seed": by_seed}
+        for rule, after, by_seed in found
     ]
 
 
-def summarise(name: str, values: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The JSON of one grid."""
+def summarise(values: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The JSON of the grid."""
     end = len(values["ep_cost"])
     tables = {metric: last(values[metric], end) for metric in METRICS}
-    labels = ["extrinsic", "margin 3x"]
-    labels += [label_of(*cost) for cost in GRIDS[name]]
+    labels = [*PLAIN, *(label_of(*cost) for cost in GRID)]
     rows = [
         {
             "cost": label,
@@ -213,7 +174,7 @@ def summarise(name: str, values: dict[str, np.ndarray]) -> dict[str, Any]:
         for a, algorithm in enumerate(ALGORITHMS)
     ]
     ranks = rank_correlations(values)
-    return {"grid": name, "epochs": end, "rows": rows, "rank_correlations": ranks}
+    return {"epochs": end, "rows": rows, "rank_correlations": ranks}
 
 
 def table(result: dict[str, Any]) -> str:
@@ -223,63 +184,54 @@ def table(result: dict[str, Any]) -> str:
         "episode | both bars |",
         "|---|---|---|---|---|",
     ]
-    for grid in result["grids"]:
-        rows = grid["rows"]
-        plain = {r["algorithm"]: r for r in rows if r["cost"] == "extrinsic"}
-        for label in dict.fromkeys(row["cost"] for row in rows):
-            mine = [row for row in rows if row["cost"] == label]
-
-            def share(metric: str, mine: Any = mine, plain: Any = plain) -> list[float]:
-                return [
-                    np.mean(r[metric]) / np.mean(plain[r["algorithm"]][metric])
-                    for r in mine
-                ]
-
-            left, kept = share("violating_worlds"), share("ep_return")
-            cost = [np.mean(row["ep_cost"]) for row in mine]
-            reached = max(left) <= 0.25 and min(kept) >= 0.3
-            lines.append(
-                f"| {label} ({grid['epochs']} epochs) | "
-                f"{left[0]:.0%}; {left[1]:.0%} | {kept[0]:.0%}; {kept[1]:.0%} | "
-                f"{cost[0]:.2f}; {cost[1]:.2f} | {'yes' if reached else 'no'} |"
-            )
+    rows = result["rows"]
+    plain = {row["algorithm"]: row for row in rows if row["cost"] == PLAIN[0]}
+    for label in dict.fromkeys(row["cost"] for row in rows):
+        mine = [row for row in rows if row["cost"] == label]
+        names = ("violating_worlds", "ep_return")
+        means = [
+            [float(np.mean(r[name])) for r in (row, plain[row["algorithm"]])]
+            for row in mine
+            for name in names
+        ]
+        (ppo_rate, ppo_return), (cpo_rate, cpo_return) = means[:2], means[2:]
+        reached = all(
+            is_success(rate[0], ep_return[0], rate[1], ep_return[1])
+            for rate, ep_return in ((ppo_rate, ppo_return), (cpo_rate, cpo_return))
+        )
+        cost = [np.mean(row["ep_cost"]) for row in mine]
+        left, kept = (
+            f"{ppo[0] / ppo[1]:.0%}; {cpo[0] / cpo[1]:.0%}"
+            for ppo, cpo in ((ppo_rate, cpo_rate), (ppo_return, cpo_return))
+        )
+        lines.append(
+            f"| {label} | {left} | {kept} | {cost[0]:.2f}; {cost[1]:.2f} | "
+            f"{'yes' if reached else 'no'} |"
+        )
     lines += [
         "",
         "| a stage ranks by | after | rank correlation, seed by seed | mean |",
+        "|---|---|---|---|",
     ]
-    lines.append("|---|---|---|---|")
-    ranks = [rank for grid in result["grids"] for rank in grid["rank_correlations"]]
-    for rule, after in dict.fromkeys((r["rule"], r["epochs"]) for r in ranks):
-        found = [
-            value
-            for rank in ranks
-            if (rank["rule"], rank["epochs"]) == (rule, after)
-            for value in rank["by_seed"]
-        ]
-        seeds = ", ".join(f"{value:.2f}" for value in found)
-        lines.append(f"| {rule} | {after} epochs | {seeds} | {np.mean(found):.2f} |")
+    for rank in result["rank_correlations"]:
+        seeds = ", ".join(f"{value:.2f}" for value in rank["by_seed"])
+        lines.append(
+            f"| {rank['rule']} | {rank['epochs']} epochs | {seeds} | "
+            f"{np.mean(rank['by_seed']):.2f} |"
+        )
     return "\n".join(lines) + "\n"
 
 
 def collect(options: Options) -> None:
-    """JSON and table of all grids."""
-    num_seeds = 2 if options.smoke else len(SEEDS)
-    grids = [
-        summarise(name, histories(options.runs / name, num_seeds))
-        for name in GRIDS
-        if (options.runs / name / "evaluation.json").exists()
-    ]
-    write({"grids": grids, "learner": LEARNER}, options.results)
-
-
-def write(result: dict[str, Any], results: Path) -> None:
-    """starts.json and starts.md."""
+    """JSON and table of the grid."""
     command = "python experiments/starts.py run && python experiments/starts.py collect"
-    result = {"command": command, "seeds": SEEDS, "facts": run_facts(), **result}
-    results.mkdir(parents=True, exist_ok=True)
-    (results / "starts.json").write_text(compact(json.loads(json.dumps(result))) + "\n")
-    (results / "starts.md").write_text(table(result))
+    result = {"command": command, "seeds": SEEDS, "facts": run_facts()}
+    result |= summarise(histories(options.runs))
+    options.results.mkdir(parents=True, exist_ok=True)
+    text = compact(json.loads(json.dumps(result)))
+    (options.results / "starts.json").write_text(text + "\n")
+    (options.results / "starts.md").write_text(table(result))
 
 
 if __name__ == "__main__":
-    run_part("starts", __doc__, {"run": run, "collect": collect}, GRIDS)
+    run_part("starts", __doc__, {"run": run, "collect": collect}, ())

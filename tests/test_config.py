@@ -112,6 +112,7 @@ BAD = {
         "multiplier_lr": POSITIVE,
         "cg_damping": POSITIVE,
         "violation_factor": POSITIVE,
+        "policy_output_scale": POSITIVE,
         "policy_passes": COUNT,
         "policy_minibatches": COUNT,
         "value_passes": COUNT,
@@ -146,7 +147,6 @@ BAD = {
         "start": ("uniform", ""),
         "network": ("wide", ""),
         "seeds_per_candidate": COUNT,
-        "training_seeds": ("common", ""),
         "references": (1, "yes"),
         "judge_by": ("best", "", "success"),  # success needs references
         "pool_scores": (1, "yes"),

@@ -448,29 +448,6 @@ def test_seeds_and_references_are_slots(key):
     assert used["safety_margin_3x"] == [15, 16, 17]
 
 
-def test_each_place_may_have_its_own_seeds_in_all_stages(key):
-    """References and finalists keep the shared seeds of their stage."""
-    candidates = jax.random.normal(key, (4, 41))
-    sizes = {"references": True, "seeds_per_candidate": 2, "num_finalists": 2}
-    config = dataclasses.replace(CONFIG, training_seeds="candidate", **sizes)
-    shared = dataclasses.replace(CONFIG, **sizes)
-
-    def keys_of(config, *args, **options):
-        group, other = stage_slots(config, key, *args, **options)
-        both = [jax.random.key_data(slots.key) for slots in (group, other)]
-        return np.concatenate(both)
-
-    first, later = (keys_of(config, stage, candidates) for stage in (0, 1))
-    own = np.r_[0:8, 12:20]  # of 6 costs x 2 seeds with each algorithm
-    assert len(np.unique(first[own], axis=0)) == 16
-    np.testing.assert_array_equal(first[own], later[own])
-    rest = np.setdiff1d(np.arange(24), own)
-    np.testing.assert_array_equal(later[rest], keys_of(shared, 1, candidates)[rest])
-    assert not (first[rest] == later[rest]).all(-1).any()
-    own, common = (keys_of(c, 2, candidates, is_final=True) for c in (config, shared))
-    np.testing.assert_array_equal(own, common)
-
-
 FINALS = dataclasses.replace(
     CONFIG,
     train=train_config(num_epochs=3),

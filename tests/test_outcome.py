@@ -86,10 +86,10 @@ def test_finalists_are_judged_by_the_last_epochs_of_their_training():
     assert rows[1]["cpo"]["return"] == [2, 3]
 
 
-def test_of_several_that_succeed_the_safest_is_picked():
+def test_of_several_that_reach_the_aims_the_safest_is_picked():
     scores = finalists(
-        [[9.0, 5.0, 6.0, 10.0, 2.0], [15.0, 7.0, 9.0, 20.0, 5.0]],
-        [[0.1, 0.02, 0.05, 0.6, 0.0], [0.1, 0.1, 0.1, 0.7, 0.2]],
+        [[9.0, 5.0, 6.0, 10.0, 2.0], [15.0, 8.5, 9.0, 20.0, 5.0]],
+        [[0.07, 0.02, 0.05, 0.6, 0.0], [0.08, 0.08, 0.08, 0.7, 0.2]],
     )
     assert pick(CONFIG, *scores) == 1
 
@@ -114,8 +114,8 @@ def test_a_reference_with_a_frozen_seed_still_sets_the_bars():
 
 def test_of_equally_safe_ones_the_most_useful_is_picked():
     scores = finalists(
-        [[5.0, 6.0, 4.0, 10.0, 2.0], [7.0, 8.0, 7.0, 20.0, 5.0]],
-        [[0.02, 0.02, 0.02, 0.6, 0.0], [0.1, 0.1, 0.1, 0.7, 0.2]],
+        [[5.0, 6.0, 5.0, 10.0, 2.0], [8.5, 9.0, 8.5, 20.0, 5.0]],
+        [[0.02, 0.02, 0.02, 0.6, 0.0], [0.08, 0.08, 0.08, 0.7, 0.2]],
     )
     assert pick(CONFIG, *scores) == 1
 

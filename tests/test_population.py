@@ -249,7 +249,7 @@ def devices(request, tmp_path_factory):
     counts = (1, 2) if toy else (1, 2, 3, 8)
     tests = str(Path(__file__).parent)
     script = SCRIPT.format(tests=tests, out=str(out), toy=toy, counts=counts)
-    flags = "--xla_backend_optimization_level=0"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
     done = subprocess.run(
         [sys.executable, "-c", script],
         env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},

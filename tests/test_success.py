@@ -6,39 +6,40 @@ import pytest
 
 from autocost_jax.search.success import is_success, shortfall
 
-PLAIN = (jnp.array([0.8, 0.4]), jnp.array([10.0, 20.0]))  # bars 0.2, 0.1 and 3, 6
+# bars 0.2, 0.1 and 3, 6; aims 0.1, 0.05 and 4, 8
+PLAIN = (jnp.array([0.8, 0.4]), jnp.array([10.0, 20.0]))
 
 
 def far(violations, ep_return, plain=PLAIN) -> list[float]:
     return shortfall(jnp.array(violations), jnp.array(ep_return), *plain).tolist()
 
 
-def test_at_both_bars_nothing_is_missing():
-    assert far([[0.2, 0.0], [0.1, 0.0]], [[3.0, 9.0], [6.0, 9.0]]) == [0.0, 0.0]
+def test_at_the_aims_nothing_is_missing():
+    assert far([[0.1, 0.0], [0.05, 0.0]], [[4.0, 9.0], [8.0, 9.0]]) == [0.0, 0.0]
 
 
 def test_what_is_missing_adds_up_over_algorithms_and_bars():
-    got = far([[0.4], [0.1]], [[1.5], [3.0]])
-    # a third of the way from 25 % to all violations, and twice half the return
-    assert got == pytest.approx([1 / 3 + 1 / 2 + 1 / 2], rel=1e-5)
+    """1 at each bar."""
+    assert far([[0.2], [0.1]], [[3.0], [6.0]]) == pytest.approx([4.0], rel=1e-5)
+    assert far([[0.15], [0.05]], [[3.5], [4.0]]) == pytest.approx([3.0], rel=1e-5)
 
 
 def test_no_algorithm_makes_up_for_another():
-    """The same means over the algorithms: 0.15 and 4.5."""
-    balanced, lopsided = far([[0.2, 0.0], [0.1, 0.3]], [[3.0, 8.0], [6.0, 1.0]])
+    """The same means over the algorithms: 0.1 and 6."""
+    balanced, lopsided = far([[0.1, 0.0], [0.05, 0.15]], [[4.0, 10.0], [8.0, 2.0]])
     assert balanced == 0.0
-    assert lopsided > 1.0
+    assert lopsided > 4.0
 
 
 def test_agents_that_flee_are_farther_off_than_a_near_miss():
-    fleeing, near = far([[0.0, 0.22], [0.0, 0.1]], [[-9.0, 2.9], [-9.0, 6.0]])
-    assert fleeing == pytest.approx(4.0 + 2.5, rel=1e-5)
-    assert near < 0.2
+    fleeing, near = far([[0.0, 0.11], [0.0, 0.05]], [[-9.0, 3.9], [-9.0, 8.0]])
+    assert fleeing == pytest.approx(13.0 + 8.5, rel=1e-5)
+    assert near < 0.3
 
 
 def test_a_broken_reference_has_no_bars_and_a_broken_score_is_seen():
     plain = (jnp.array([np.nan, 0.4]), jnp.array([10.0, 20.0]))
-    assert far([[0.9], [0.1]], [[0.0], [6.0]], plain) == [0.0]
+    assert far([[0.9], [0.05]], [[0.0], [8.0]], plain) == [0.0]
     assert np.isnan(far([[np.nan], [0.1]], [[3.0], [6.0]])).all()
 
 

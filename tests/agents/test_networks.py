@@ -1,3 +1,6 @@
+import copy
+
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,6 +50,18 @@ def test_init_is_glorot_uniform_with_zero_biases(nets):
         assert np.abs(kernel).max() > 0.97 * bound
         # 5 sigmas of the standard deviation of the smallest kernel (256 entries)
         assert kernel.std() == pytest.approx(bound / np.sqrt(3), rel=0.15)
+
+
+def test_policy_may_begin_all_but_still(nets):
+    """A scaled last layer, all else as without."""
+    _, policy, critic = copy.deepcopy(nets)
+    small = make_networks(AgentConfig(policy_output_scale=0.01), 28, 2)
+    policy_small, critic_small = jax.jit(small.init)(jax.random.key(0))
+    last = "Dense_2"
+    scaled = 0.01 * policy["mean"].pop(last)["kernel"]
+    got = policy_small["mean"].pop(last)["kernel"]
+    np.testing.assert_allclose(got, scaled, rtol=1e-5)
+    chex.assert_trees_all_equal((policy_small, critic_small), (policy, critic))
 
 
 def test_critics_are_two_separate_nets(nets):

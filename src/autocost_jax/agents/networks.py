@@ -41,30 +41,30 @@ class Mlp(nn.Module):
     """tanh layers of `hidden_sizes`, then a linear layer of `output_size`.
 
     The hidden layers compute in `hidden_dtype`, the output in that of the parameters.
+    Its weights begin at `output_scale` times Glorot's.
     """
 
     hidden_sizes: tuple[int, ...]
     output_size: int
     param_dtype: Any
     hidden_dtype: Any = None
+    output_scale: float = 1.0
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Outputs [..., output_size] for inputs x [..., I]."""
 
-        def dense(size: int, dtype: Any) -> nn.Dense:
+        def dense(size: int, dtype: Any, scale: float = 1.0) -> nn.Dense:
+            glorot = nn.initializers.variance_scaling(scale**2, "fan_avg", "uniform")
             return nn.Dense(
-                size,
-                kernel_init=nn.initializers.glorot_uniform(),
-                param_dtype=self.param_dtype,
-                dtype=dtype,
+                size, kernel_init=glorot, param_dtype=self.param_dtype, dtype=dtype
             )
 
         for size in self.hidden_sizes:
             x = nn.tanh(dense(size, self.hidden_dtype)(x))
         if self.hidden_dtype is not None:
             x = x.astype(self.param_dtype)
-        return dense(self.output_size, None)(x)
+        return dense(self.output_size, None, self.output_scale)(x)
 
 
 class GaussianPolicy(nn.Module):
@@ -74,11 +74,18 @@ class GaussianPolicy(nn.Module):
     action_size: int
     log_std_init: float
     param_dtype: Any
+    output_scale: float = 1.0
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Mean [..., U] and log_std [U] for obs [..., O]."""
-        mlp = Mlp(self.hidden_sizes, self.action_size, self.param_dtype, name="mean")
+        mlp = Mlp(
+            self.hidden_sizes,
+            self.action_size,
+            self.param_dtype,
+            output_scale=self.output_scale,
+            name="mean",
+        )
         log_std = self.param(
             "log_std",
             nn.initializers.constant(self.log_std_init),
@@ -94,7 +101,7 @@ def make_networks(
     """The networks of one agent, in JAX's default float type.
 
     Args:
-      config: sizes of the hidden layers and the initial log std.
+      config: sizes of the hidden layers; the policy's first log std and output scale.
       observation_size: O.
       action_size: U.
 
@@ -103,7 +110,11 @@ def make_networks(
     """
     dtype = jnp.result_type(float)
     policy = GaussianPolicy(
-        config.hidden_sizes, action_size, config.log_std_init, dtype
+        config.hidden_sizes,
+        action_size,
+        config.log_std_init,
+        dtype,
+        config.policy_output_scale,
     )
     critic = Mlp(config.hidden_sizes, 1, dtype)
     critic_bfloat16 = critic.clone(hidden_dtype=jnp.bfloat16)

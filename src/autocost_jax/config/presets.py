@@ -9,6 +9,7 @@ from autocost_jax.config.training import AgentConfig, SearchConfig, TrainConfig
 _LAPTOP_AGENT = AgentConfig(
     normalize_obs=True,
     hidden_sizes=(32, 32),
+    policy_output_scale=0.01,
     gae_lambda=0.95,
     cost_gae_lambda=0.95,
     target_kl=0.02,
@@ -17,9 +18,9 @@ _LAPTOP_AGENT = AgentConfig(
     value_passes=4,
     value_minibatches=8,
     multiplier_init=0.5,
-    multiplier_lr=0.01,
+    multiplier_lr=0.02,
     cg_iterations=5,
-    violation_factor=1.2,
+    violation_factor=1.5,
 )
 
 # Long stages rather than many (`experiments/fitness.py`), a start among costs of which
@@ -32,7 +33,6 @@ _GUIDED: dict[str, Any] = {
     "mutation_high": 1.1,
     "references": True,
     "judge_by": "success",
-    "training_seeds": "candidate",
     "pool_scores": True,
 }
 

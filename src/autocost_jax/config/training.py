@@ -32,7 +32,6 @@ Algorithm = Literal["ppo_lagrangian", "cpo"]
 Selection = Literal["paper", "random"]
 Start = Literal["normal", "graded"]
 Judge = Literal["cost", "success"]
-TrainingSeeds = Literal["stage", "candidate"]
 Precision = Literal["float32", "tensorfloat32", "bfloat16"]
 CostNetwork = Literal["lidar_mlp", "min_distance"]
 THETA_SIZES: dict[CostNetwork, int] = {"lidar_mlp": 41, "min_distance": 13}
@@ -44,10 +43,10 @@ class AgentConfig:
 
     Where the paper is silent they are Safety Gym's starter agents'. An update makes
     `policy_passes` x `policy_minibatches` policy steps (CPO: always one full-batch
-    step) and `value_passes` x `value_minibatches` critic steps. `normalize_obs` and
-    `violation_factor` are ours. Lower `critic_precision` is for the hidden layers in
-    the critics' own steps alone: tensorfloat32 (of a GPU; float32 elsewhere) or
-    bfloat16.
+    step) and `value_passes` x `value_minibatches` critic steps. `normalize_obs`,
+    `policy_output_scale` and `violation_factor` are ours. Lower `critic_precision` is
+    for the hidden layers in the critics' own steps alone: tensorfloat32 (of a GPU;
+    float32 elsewhere) or bfloat16.
     """
 
     hidden_sizes: tuple[int, ...] = setting(
@@ -57,6 +56,9 @@ class AgentConfig:
         False, SWITCH, "bring observations to mean 0 and deviation 1 over all seen"
     )
     log_std_init: float = setting(-0.5, FINITE, "log deviation of actions at first")
+    policy_output_scale: float = setting(
+        1.0, POSITIVE, "x Glorot's weights of the policy's last layer at first"
+    )
     gamma: float = setting(0.99, DISCOUNT, "discount of rewards")
     gae_lambda: float = setting(0.97, SHARE, "of the reward's advantages")
     cost_gamma: float = setting(0.99, DISCOUNT, "discount of costs")
@@ -156,12 +158,9 @@ class SearchConfig:
     Options of ours beside the paper's rule, all off by default. `start="graded"` draws
     first costs that rise as anything comes nearer, with a set reach and loudness, see
     `graded_start`. Each candidate is trained with `seeds_per_candidate` seeds and
-    judged by their mean. With `training_seeds="stage"` a stage's candidates share these
-    seeds, and each stage has new ones; with "candidate" each place of the population
-    has its own, the same in every stage, so that stages compare place by place and
-    their means do not hang on one seed. With `references` each algorithm trains two
-    more costs with as many seeds in every stage, the extrinsic cost alone and with a
-    margin of 3x.
+    judged by their mean; a stage's candidates share these seeds, and each stage has new
+    ones. With `references` each algorithm trains two more costs with as many seeds in
+    every stage, the extrinsic cost alone and with a margin of 3x.
     `judge_by="success"` compares candidates with the first of them, by violating
     episodes and return and for each algorithm, see `shortfall`; the paper's
     rule alone rewards costs that make agents flee or stand still, as these are the
@@ -205,11 +204,6 @@ class SearchConfig:
         "the paper's of 8 readings, or of the highest alone",
     )
     seeds_per_candidate: int = setting(1, COUNT, "trainings by which one is judged")
-    training_seeds: TrainingSeeds = setting(
-        "stage",
-        one_of(TrainingSeeds),
-        "shared by a stage, or each place's own in all stages",
-    )
     references: bool = setting(
         False, SWITCH, "train the extrinsic cost alone and a 3x margin beside"
     )

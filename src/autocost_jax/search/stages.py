@@ -38,7 +38,7 @@ REFERENCES = {
     "safety_margin_3x": "extrinsic+safety_margin_3x",
 }
 # Purposes of a stage's keys: every key is fold_in(root, stage, purpose).
-ASK, TELL, SLOTS, OWN = range(4)
+ASK, TELL, SLOTS = range(3)
 
 
 class StageResult(struct.PyTreeNode):
@@ -158,29 +158,21 @@ def stage_slots(
 ) -> tuple[Slot, ...]:
     """For each algorithm the slots [N] of a stage, or of the finalists'.
 
-    All costs share the keys of the seeds (common random numbers); with own seeds the
-    candidates do not, see `SearchConfig`. Of the candidates in the finalists' stage the
-    first `num_finalists` are trained.
+    All costs share the keys of the seeds (common random numbers). Of the candidates in
+    the finalists' stage the first `num_finalists` are trained.
     """
     dealt = deal(config, is_final)
     if is_final:
         candidates = candidates[: config.num_finalists]
     costs = stage_costs(config, candidates, bank)
     cost = jax.tree.map(lambda leaf: leaf[dealt.cost], costs)
-    shared = stage_key(root, stage, SLOTS)
-    place = dealt.cost * dealt.num_seeds + dealt.seed
-    own_seeds = config.training_seeds == "candidate" and not is_final
-    has_own = own_seeds & (dealt.cost < config.population_size)
-
-    def keys(key: Key, index: int, seeds: np.ndarray) -> Key:
-        key = jax.random.fold_in(key, index)
-        return jax.vmap(lambda seed: jax.random.fold_in(key, seed))(seeds)
+    key = stage_key(root, stage, SLOTS)
 
     def group(index: int) -> Slot:
-        own = keys(stage_key(root, 0, OWN), index, place)
+        own = jax.random.fold_in(key, index)
         return Slot(
             cost=cost,
-            key=jnp.where(has_own, own, keys(shared, index, dealt.seed)),
+            key=jax.vmap(lambda seed: jax.random.fold_in(own, seed))(dealt.seed),
             constrained=jnp.ones(len(dealt.seed), jnp.float32),
         )
 
