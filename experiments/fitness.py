@@ -16,7 +16,6 @@ the truth of the same costs. The extrinsic cost alone and a margin of 3x are tra
 beside them as references.
 """
 
-import argparse
 import dataclasses
 import itertools
 import json
@@ -27,10 +26,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import REDUCED, compact
+from common import REDUCED, Options, compact, run_part
 
 from autocost_jax.agents.base import actor
-from autocost_jax.commandline import use_devices
 from autocost_jax.config import EnvConfig, TrainConfig
 from autocost_jax.costs import training_cost
 from autocost_jax.envs.env import make_env
@@ -112,14 +110,10 @@ def train(
     slots: Any,
     epochs: int,
     what: str,
-    seconds: float = np.inf,
 ) -> tuple[EpochState, dict[str, np.ndarray]]:
-    """The state after so many epochs or seconds, and `KEPT` metrics [E, A, C * S]."""
+    """The state after so many epochs, and `KEPT` metrics [E, A, C * S]."""
     rows, start = [], time.monotonic()
     for epoch in range(epochs):
-        if time.monotonic() - start > seconds:
-            print(f"{what}: stopped after {epoch} epochs", flush=True)
-            break
         state, metrics = population.chunk(state, slots, epoch)
         rows.append([{name: group[name][0] for name in KEPT} for group in metrics])
         jax.block_until_ready(metrics)
@@ -146,9 +140,16 @@ def warm_start(
     return EpochState(tuple(groups))
 
 
-def run(path: Path, size: Size, config: TrainConfig, seconds: float) -> None:
-    """All three trainings and the evaluation, into one npz, in about `seconds`."""
-    begin = time.monotonic()
+def run(options: Options) -> None:
+    """All three trainings and the evaluation, into one npz."""
+    path, size = options.runs, SMOKE if options.smoke else Size()
+    path.mkdir(parents=True, exist_ok=True)
+    config = TrainConfig(
+        env=EnvConfig(physics="closed_form", num_steps=100 if options.smoke else 1000),
+        agent=dataclasses.replace(REDUCED, normalize_obs=True),
+        num_worlds=4,
+        num_epochs=1,
+    )
     env = make_env(config.env)
     agents = make_agents(ALGORITHMS, config, env)
     population = make_population(env, agents, config, devices=jax.devices())
@@ -171,9 +172,8 @@ def run(path: Path, size: Size, config: TrainConfig, seconds: float) -> None:
     state, metrics = train(population, state, slots, size.warm, "warm")
     keep("warm", metrics)
     slots = make_slots(theta, size, 0)
-    left = seconds - (time.monotonic() - begin)
     state, metrics = train(
-        population, population.init(slots), slots, size.truth, "truth", left
+        population, population.init(slots), slots, size.truth, "truth"
     )
     keep("truth", metrics)
     print("evaluating", flush=True)
@@ -286,8 +286,9 @@ def correlations(arrays: Any, rule: Rule, graded: np.ndarray) -> dict[str, Any]:
     }
 
 
-def collect(path: Path, results: Path) -> None:
+def collect(options: Options) -> None:
     """JSON and table: rank correlation of every rule with the truth."""
+    path, results = options.runs, options.results
     with np.load(path / "fitness.npz") as file:
         arrays = {name: file[name] for name in file.files}
     size = Size()
@@ -334,26 +335,5 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=("run", "collect"))
-    parser.add_argument("--out", type=Path, default=Path("runs/fitness"))
-    results = Path("experiments/results/fitness")
-    parser.add_argument("--results", type=Path, default=results)
-    parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--seconds", type=float, default=np.inf)
-    args = parser.parse_args()
-    if args.part == "collect":
-        collect(args.out, args.results)
-        return
-    args.out.mkdir(parents=True, exist_ok=True)
-    use_devices(None)
-    env = EnvConfig(physics="closed_form", num_steps=100 if args.smoke else 1000)
-    agent = dataclasses.replace(REDUCED, normalize_obs=True)
-    config = TrainConfig(env=env, agent=agent, num_worlds=4, num_epochs=1)
-    run(args.out, SMOKE if args.smoke else Size(), config, args.seconds)
-
-
 if __name__ == "__main__":
-    main()
+    run_part("fitness", __doc__, {"run": run, "collect": collect}, ())

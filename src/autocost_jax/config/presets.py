@@ -17,10 +17,10 @@ _LAPTOP_AGENT = AgentConfig(
     policy_minibatches=8,
     value_passes=4,
     value_minibatches=8,
-    multiplier_init=0.5,
-    multiplier_lr=0.02,
+    multiplier_init=1.0,
+    multiplier_lr=0.01,
     cg_iterations=5,
-    violation_factor=1.5,
+    violation_factor=1.35,
 )
 
 # Long stages rather than many (`experiments/fitness.py`), a start among costs of which
@@ -50,7 +50,7 @@ PRESETS: dict[str, SearchConfig] = {
         num_stages=2,
         fitness_epochs=12,
         num_finalists=4,
-        final_epochs=110,
+        final_epochs=100,
         **_GUIDED,
     ),
     "search": SearchConfig(
