@@ -72,7 +72,8 @@ def test_costs_of_the_study_of_starts_are_those_of_the_script():
     result = json.loads((RESULTS / "starts" / "starts.json").read_text())
     labels = {*starts.PLAIN, *(starts.label_of(*cost) for cost in starts.GRID)}
     assert {row["cost"] for row in result["rows"]} == labels
-    assert result["epochs"] == preset("laptop").final_epochs
+    known = {field.name for field in dataclasses.fields(AgentConfig)}
+    assert set(result["agent"]) <= known  # a preset's learner of that time
 
 
 def test_a_stage_that_tells_the_truth_ranks_perfectly():
