@@ -29,7 +29,7 @@ from autocost_jax.config import TrainConfig, preset
 from autocost_jax.envs.env import make_env
 from autocost_jax.rollout import typical_lidars
 from autocost_jax.runs.config_files import read_metrics
-from autocost_jax.runs.directory import read_config, run_facts
+from autocost_jax.runs.directory import read_config
 from autocost_jax.runs.sweep import Method, SweepConfig
 from autocost_jax.search.starts import graded_start
 from autocost_jax.search.success import is_success, shortfall
@@ -225,9 +225,9 @@ def table(result: dict[str, Any]) -> str:
 def collect(options: Options) -> None:
     """JSON and table of the grid."""
     command = "python experiments/starts.py run && python experiments/starts.py collect"
-    train = read_config(options.runs, SweepConfig)[0].train
-    agent = dataclasses.asdict(train.agent)
-    result = {"command": command, "seeds": SEEDS, "facts": run_facts(), "agent": agent}
+    config, facts = read_config(options.runs, SweepConfig)
+    agent = dataclasses.asdict(config.train.agent)
+    result = {"command": command, "seeds": SEEDS, "facts": facts, "agent": agent}
     result |= summarise(histories(options.runs))
     options.results.mkdir(parents=True, exist_ok=True)
     text = compact(json.loads(json.dumps(result)))
