@@ -11,14 +11,15 @@ from autocost_jax.runs.directory import RunDir, read_metrics
 from autocost_jax.runs.sweep import Method, SweepConfig, sweep_slots
 
 TRAIN = ["train", "--preset", "smoke", "--episodes", "3"]
+FLAGS = ["--algorithms", "ppo", "ppo_lagrangian", "--num-seeds", "2", "--limit", "0.5"]
+FLAGS += ["--cost", "extrinsic+safety_margin_2x"]
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """PPO and CPO, two seeds each, with a hand-made cost."""
+    """Plain and constrained PPO, two seeds each, with a hand-made cost."""
     out = tmp_path_factory.mktemp("runs") / "train"
-    flags = ["--algorithms", "ppo", "cpo", "--cost", "extrinsic+safety_margin_2x"]
-    main([*TRAIN, *flags, "--num-seeds", "2", "--limit", "0.5", "--out", str(out)])
+    main([*TRAIN, *FLAGS, "--out", str(out)])
     return out
 
 
@@ -28,20 +29,20 @@ def test_train_scores_every_method_and_seed(trained):
     assert [(row["method"], row["seed"]) for row in rows] == [
         ("ppo", 0),
         ("ppo", 1),
-        ("cpo", 0),
-        ("cpo", 1),
+        ("ppo_lagrangian", 0),
+        ("ppo_lagrangian", 1),
     ]
     assert all(row["episodes"] == 3 for row in rows)
     epochs = read_metrics(trained)
     assert [row["epoch"] for row in epochs] == [0, 1]
-    assert epochs[0]["ppo_lagrangian/multiplier"] == [0.0, 0.0]  # PPO ignores cost
+    multipliers = epochs[0]["ppo_lagrangian/multiplier"]
+    assert multipliers[:2] == [0.0, 0.0]  # PPO ignores cost
+    assert min(multipliers[2:]) > 0.0
 
 
 def test_train_resumes_and_ends_the_same(trained, capsys):
     before = (trained / "evaluation.json").read_text()
-    flags = ["--algorithms", "ppo", "cpo", "--cost", "extrinsic+safety_margin_2x"]
-    flags += ["--num-seeds", "2", "--limit", "0.5", "--out", str(trained)]
-    main([*TRAIN, *flags, "--resume"])
+    main([*TRAIN, *FLAGS, "--out", str(trained), "--resume"])
     assert "resuming" in capsys.readouterr().out
     assert (trained / "evaluation.json").read_text() == before
 
@@ -81,15 +82,15 @@ def test_of_a_flag_given_twice_the_last_wins(trained, asked):
     main(["train", "--resume", "--no-resume", "--out", str(trained)])
     smoke, resumed, fresh = asked
     assert smoke.train == preset("smoke").train
-    assert [method.label for method in resumed.methods] == ["ppo", "cpo"]
+    assert [method.label for method in resumed.methods] == ["ppo", "ppo_lagrangian"]
     assert fresh.train == preset("laptop").train
 
 
 def test_evaluate_scores_saved_policies(trained, tmp_path, capsys):
     out = tmp_path / "scores.json"
     flags = ["--episodes", "4", "--deterministic", "--json", str(out)]
-    main(["evaluate", "--run", str(trained), "--policies", "cpo_seed1", *flags])
-    assert "cpo_seed1: return" in capsys.readouterr().out
+    main(["evaluate", "--run", str(trained), "--policies", "ppo_lagrangian_seed1", *flags])
+    assert "ppo_lagrangian_seed1: return" in capsys.readouterr().out
     (row,) = json.loads(out.read_text())
     assert row["episodes"] == 4
     assert np.isfinite(row["return_mean"])

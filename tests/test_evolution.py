@@ -225,6 +225,7 @@ def test_chunks_of_another_length(events):
 # Cohorts ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_with_cohorts_fitness_is_of_whole_fresh_episodes():
     """Pure or in chunks it is the same search, and its fitness no training metric."""
     train = train_config(num_epochs=6, segments_per_episode=2)
@@ -494,14 +495,14 @@ def test_the_pure_search_trains_the_same_finalists():
 
 def test_success_is_judged_against_the_extrinsic_cost_for_each_algorithm():
     """Fleeing agents, a useful cost, one that is safe with PPO alone, a useful one."""
-    rates = [[0.0, 0.1, 0.0, 0.05, 0.8, 0.1], [0.0, 0.2, 0.8, 0.1, 0.8, 0.1]]
-    ep_return = jnp.broadcast_to(jnp.array([-5.0, 4, 9, 3, 10, 1]), (3, 2, 6))
+    rates = [[0.0, 0.09, 0.0, 0.05, 0.8, 0.1], [0.0, 0.09, 0.8, 0.09, 0.8, 0.1]]
+    ep_return = jnp.broadcast_to(jnp.array([-5.0, 6, 9, 5, 10, 1]), (3, 2, 6))
     history = make_history(jnp.zeros((3, 2, 6)), ep_return)
     history["violating_worlds"] = jnp.broadcast_to(jnp.array(rates), (3, 2, 6))
     result = stage_result(FINALS, jnp.zeros((4, 41)), history, jnp.zeros((2, 6), bool))
-    far = [2 * (0.3 + 0.5) / 0.3, 0.0, 1.0, 0.0]
+    far = [2 * (0.4 + 0.5) / 0.1, 0.0, (1 - 0.125) / 0.125, 0.0]
     np.testing.assert_allclose(result.fitness.cost, far, rtol=1e-5)
-    assert result.order.tolist() == [1, 3, 2, 0]  # of two that succeed the bolder one
+    assert result.order.tolist() == [1, 3, 2, 0]  # of two at the aims the bolder one
     assert result.references["ep_return"].tolist() == [[10.0, 1.0]] * 2
 
 
@@ -513,8 +514,8 @@ def test_a_broken_reference_sets_no_bars():
     frozen = jnp.zeros((2, 12), bool).at[0, 8].set(True).at[1, 8:10].set(True)
     result = stage_result(config, jnp.zeros((4, 41)), history, frozen)
     np.testing.assert_array_equal(result.references["ep_return"][:, 0], [9.0, np.nan])
-    bar = 0.3 * 9.0  # of PPO-Lagrangian alone
-    far = 1 - np.array([0.5, 2.5, bar, bar]) / bar
+    aim = 0.4 * 9.0  # of PPO-Lagrangian alone; its bar lies 0.9 below
+    far = (aim - np.array([0.5, 2.5, aim, aim])) / 0.9
     np.testing.assert_allclose(result.fitness.cost, far, rtol=1e-5, atol=1e-6)
 
 

@@ -330,6 +330,7 @@ def check_pillar_steps(name: str, physics: str = "reduced") -> None:
     np.testing.assert_array_equal(after.cost, touches)
 
 
+@pytest.mark.slow
 def test_single_steps_of_a_point_at_pillars():
     check_pillar_steps("Goal-Pillar-Point")
 
