@@ -89,8 +89,8 @@ def test_of_a_flag_given_twice_the_last_wins(trained, asked):
 def test_evaluate_scores_saved_policies(trained, tmp_path, capsys):
     out = tmp_path / "scores.json"
     flags = ["--episodes", "4", "--deterministic", "--json", str(out)]
-    main(["evaluate", "--run", str(trained), "--policies", "ppo_lagrangian_seed1", *flags])
-    assert "ppo_lagrangian_seed1: return" in capsys.readouterr().out
+    main(["evaluate", "--run", str(trained), "--policies", "ppo_seed1", *flags])
+    assert "ppo_seed1: return" in capsys.readouterr().out
     (row,) = json.loads(out.read_text())
     assert row["episodes"] == 4
     assert np.isfinite(row["return_mean"])
@@ -139,7 +139,7 @@ def test_unknown_policy_lists_those_of_the_run(trained, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["evaluate", "--run", str(trained), "--policies", "best"])
     assert stop.value.code == 2
-    assert "cpo_seed0" in capsys.readouterr().err
+    assert "ppo_seed0" in capsys.readouterr().err
 
 
 def test_no_command_prints_the_commands(capsys):
