@@ -188,24 +188,17 @@ def table(result: dict[str, Any]) -> str:
     plain = {row["algorithm"]: row for row in rows if row["cost"] == PLAIN[0]}
     for label in dict.fromkeys(row["cost"] for row in rows):
         mine = [row for row in rows if row["cost"] == label]
-        names = ("violating_worlds", "ep_return")
-        means = [
-            [float(np.mean(r[name])) for r in (row, plain[row["algorithm"]])]
-            for row in mine
-            for name in names
-        ]
-        (ppo_rate, ppo_return), (cpo_rate, cpo_return) = means[:2], means[2:]
-        reached = all(
-            is_success(rate[0], ep_return[0], rate[1], ep_return[1])
-            for rate, ep_return in ((ppo_rate, ppo_return), (cpo_rate, cpo_return))
-        )
-        cost = [np.mean(row["ep_cost"]) for row in mine]
-        left, kept = (
-            f"{ppo[0] / ppo[1]:.0%}; {cpo[0] / cpo[1]:.0%}"
-            for ppo, cpo in ((ppo_rate, cpo_rate), (ppo_return, cpo_return))
-        )
+        left, kept, cost, reached = [], [], [], True
+        for row in mine:
+            pair = row, plain[row["algorithm"]]
+            rates = [float(np.mean(each["violating_worlds"])) for each in pair]
+            returns = [float(np.mean(each["ep_return"])) for each in pair]
+            left.append(f"{rates[0] / rates[1]:.0%}")
+            kept.append(f"{returns[0] / returns[1]:.0%}")
+            cost.append(f"{np.mean(row['ep_cost']):.2f}")
+            reached &= is_success(rates[0], returns[0], rates[1], returns[1])
         lines.append(
-            f"| {label} | {left} | {kept} | {cost[0]:.2f}; {cost[1]:.2f} | "
+            f"| {label} | {'; '.join(left)} | {'; '.join(kept)} | {'; '.join(cost)} | "
             f"{'yes' if reached else 'no'} |"
         )
     lines += [

@@ -138,9 +138,9 @@ def last_scores(
 
 
 def pick(config: SearchConfig, ep_return: np.ndarray, violations: np.ndarray) -> int:
-    """The finalist that comes closest to success, see `shortfall`.
+    """The finalist that comes closest to a search's aims, see `shortfall`.
 
-    Of several that reach its aims it is the one of fewest violating episodes; without
+    Of several that reach them it is the one of fewest violating episodes; without
     references violations alone decide.
 
     Args:
