@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import html
 import json
 import re
@@ -164,6 +165,12 @@ def make_data(size=8, zero=True, **changes):
     return dataclasses.replace(data, **changes)
 
 
+@functools.cache
+def drawn_page():
+    """The page of `make_data()`; drawn once, for tests that ask for `drawn`."""
+    return report.render_report(make_data())
+
+
 def make_summary(best_rate=0.0, outside=0.0):
     """Fresh scores of both algorithms under the three costs."""
     scores = {
@@ -219,10 +226,13 @@ def test_lidar_turns_with_the_robot():
 
 
 @pytest.mark.usefixtures("drawn")
+def test_page_with_figures_is_self_contained():
+    assert_self_contained(drawn_page(), canvas=True)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
-        {},
         {"replays": (), "summary": (), "references": (), "curves": ()},
         {"stages": (), "best": None, "conclusion": ""},
         {"stages": (), "best": None, "curves": (), "replays": ()},
@@ -232,8 +242,12 @@ def test_lidar_turns_with_the_robot():
 )
 def test_page_is_self_contained(changes):
     text = report.render_report(make_data(**changes))
+    assert_self_contained(text, canvas="replays" not in changes)
+
+
+def assert_self_contained(text, canvas):
     page = check_page(text)
-    assert ("canvas" in page.tags) == ("replays" not in changes)
+    assert ("canvas" in page.tags) == canvas
     assert "{{" not in text
     shown = re.sub(r"<script>.*", "", text, flags=re.DOTALL)
     assert not re.search(r"\b(nan|NaN|inf|Infinity)\b", shown)
@@ -247,7 +261,6 @@ def test_all_candidates_may_diverge():
     assert "Every candidate of a stage diverged" in report.verdict(data)
 
 
-@pytest.mark.usefixtures("drawn")
 def test_non_finite_replay_stays_strict_json():
     recording = make_recording(50)
     recording.qpos[12:], recording.reward[4] = np.nan, np.inf
@@ -312,7 +325,7 @@ def rows_of(page, section):
 
 @pytest.mark.usefixtures("drawn")
 def test_the_page_begins_with_the_outcome():
-    page = report.render_report(make_data())
+    page = drawn_page()
     order = ("outcome", "tradeoff", "replay", "best", "evolution", "learning")
     places = [page.index(f'<section id="{name}"') for name in (*order, "stages")]
     assert places == sorted(places)
@@ -347,7 +360,6 @@ def test_unknown_scores_are_dashes():
     ]  # fmt: skip
 
 
-@pytest.mark.usefixtures("drawn")
 def test_without_fresh_scores_the_page_claims_no_success():
     data = make_data(conclusion="", summary=())
     text = report.verdict(data)
@@ -367,7 +379,7 @@ def test_short_episodes_say_nothing_about_safety():
     assert '<tr class="zero"' not in page
     for claim in ("zero violation", "had no violation", "no violation</text>"):
         assert claim not in shown
-    claims = report.render_report(make_data())
+    claims = drawn_page()
     assert '<tr class="zero"' in claims
     assert "zero violation" in claims
 
@@ -386,7 +398,7 @@ def test_people_count_candidates_from_one():
 
 @pytest.mark.usefixtures("drawn")
 def test_nobody_is_called_timid():
-    assert "timid" not in report.render_report(make_data()).lower()
+    assert "timid" not in drawn_page().lower()
 
 
 @pytest.mark.parametrize(
@@ -502,7 +514,6 @@ def test_a_comparison_needs_two_episodes(tmp_path):
     assert not path.exists()
 
 
-@pytest.mark.usefixtures("drawn")
 def test_a_comparison_is_one_page(tmp_path):
     lengths = {"a": 50, "b": 100}
     pair = [make_replay(steep_theta(), n, label) for label, n in lengths.items()]
@@ -606,7 +617,6 @@ def test_browser_plays_the_replay(tmp_path):
     assert "ERR_" not in log
 
 
-@pytest.mark.usefixtures("drawn")
 def test_one_slider_moves_two_replays(tmp_path):
     """The shorter episode waits at its end; both say where they are."""
     pair = [
@@ -622,7 +632,6 @@ def test_one_slider_moves_two_replays(tmp_path):
     assert "CONSOLE" not in log
 
 
-@pytest.mark.usefixtures("drawn")
 def test_a_fleeing_robot_is_followed_and_called_outside(tmp_path):
     recording = make_recording(50)
     recording.qpos[:, 0] += np.linspace(0, 25, 51)

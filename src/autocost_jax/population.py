@@ -3,9 +3,10 @@
 The chunk is K epochs of the whole population under `jax.shard_map`: each device holds
 its share of every group and trains it without talking to the others. Groups are padded
 with copies of their first slot to a multiple of the device count. One code path serves
-one device and many. All `jax.jit` calls of the library are in this module.
+one device and many. Programs are compiled here and in `bench` alone.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -90,6 +91,22 @@ def candidate_slots(cost: TrainingCost, key: Key, constrained: float = 1.0) -> S
 def jit_bundle(bundle: Any) -> Any:
     """A NamedTuple of pure functions with each of them jitted."""
     return type(bundle)(*(jax.jit(fn) for fn in bundle))
+
+
+def run_compiled(function: Callable[..., Any], *args: Any, **settings: Any) -> Any:
+    """`function(*args, **settings)` as one program, not one for each operation.
+
+    Args:
+      function: pure.
+      args: arrays.
+      settings: hashable; they shape the program.
+    """
+    return _program(function, tuple(settings.items()))(*args)
+
+
+@functools.cache
+def _program(function: Callable[..., Any], settings: tuple[Any, ...]) -> Any:
+    return jax.jit(functools.partial(function, **dict(settings)))
 
 
 def make_population(

@@ -11,6 +11,7 @@ from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import Env
 from autocost_jax.es import Fitness
 from autocost_jax.files import flatten
+from autocost_jax.population import run_compiled
 from autocost_jax.runs.directory import RunDir
 from autocost_jax.runs.outcome import (
     BEST,
@@ -51,11 +52,12 @@ def finish(
     """
     config = run.config
     best_of(config, state.es)  # refuses a failed search
-    fitness, order = es_lib.top(
+    fitness, order = run_compiled(
+        es_lib.top,
         state.es,
-        max(1, config.num_finalists),
-        config.zero_tolerance,
-        config.pool_scores,
+        num=max(1, config.num_finalists),
+        zero_tolerance=config.zero_tolerance,
+        pool_scores=config.pool_scores,
     )
     learners = state.training.learners
     chosen, finalists = 0, []

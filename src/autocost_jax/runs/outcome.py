@@ -15,7 +15,7 @@ from autocost_jax.agents.base import Actor, actor
 from autocost_jax.config import SearchConfig, TrainConfig
 from autocost_jax.envs.env import Env
 from autocost_jax.evaluate import Recording, first_recording, watch_first
-from autocost_jax.population import make_evaluator
+from autocost_jax.population import make_evaluator, run_compiled
 from autocost_jax.records import EvalResult, Key, Metrics
 from autocost_jax.runs.labels import COST_LABELS, algorithm_label
 from autocost_jax.runs.policies import policy_states
@@ -86,6 +86,7 @@ def score_agents(
         values[a, s] = jax.tree.map(np.asarray, result)
         if s == 0:
             each = range(num_costs)
+            episodes = jax.tree.map(np.asarray, episodes)
             one = [jax.tree.map(lambda x, c=c: x[c], episodes) for c in each]
             recordings.append([first_recording(episode) for episode in one])
         tell(done, len(parts))
@@ -156,7 +157,7 @@ def pick(config: SearchConfig, ep_return: np.ndarray, violations: np.ndarray) ->
     short = np.zeros(count)
     if config.references:
         costs = (violations[:, :count], ep_return[:, :count])
-        short = np.asarray(shortfall(*costs, *plain))
+        short = np.asarray(run_compiled(shortfall, *costs, *plain))
     order = np.lexsort(
         (
             -ep_return[:, :count].mean(0),
@@ -308,7 +309,7 @@ def final_actors(
     costs = [chosen, *range(config.num_finalists, dealt.num_costs)]
     slots = np.concatenate([np.flatnonzero(dealt.cost == cost) for cost in costs])
     actors = [
-        jax.tree.map(lambda leaf: jnp.asarray(leaf[slots]), actor(learner.agent))
+        jax.tree.map(lambda leaf: np.asarray(leaf)[slots], actor(learner.agent))
         for learner in learners
     ]
     return actors, dealt.num_seeds

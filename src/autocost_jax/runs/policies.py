@@ -46,20 +46,27 @@ def load_policies(
     Raises:
       RunDirError: a file is missing or is not such a policy.
     """
-    part = actor(_acting_agent(env, train).init(jax.random.key(0)))
+    part = actor(_shapes(_acting_agent(env, train)))
     loaded = [unflatten(load_arrays(file, None), part) for file in files]
-    return policy_states(env, train, jax.tree.map(lambda *x: jnp.stack(x), *loaded))
+    return policy_states(env, train, jax.tree.map(lambda *x: np.stack(x), *loaded))
 
 
 def policy_states(env: Env, train: TrainConfig, actors: Actor) -> tuple[Agent, Any]:
-    """Actors [P, ...] as one stacked agent state, and the agent that acts for it."""
+    """Actors [P, ...] as one stacked agent state, and the agent that acts for it.
+
+    What does not act is zero.
+    """
     agent = _acting_agent(env, train)
     size = jax.tree.leaves(actors)[0].shape[0]
-    stacked = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (size, *leaf.shape)),
-        agent.init(jax.random.key(0)),
+    zeros = jax.tree.map(
+        lambda leaf: np.zeros((size, *leaf.shape), leaf.dtype), _shapes(agent)
     )
-    return agent, dataclasses.replace(stacked, **actors._asdict())
+    return agent, dataclasses.replace(zeros, **actors._asdict())
+
+
+def _shapes(agent: Agent) -> Any:
+    """Of the state of one agent."""
+    return jax.eval_shape(agent.init, jax.random.key(0))
 
 
 def _acting_agent(env: Env, train: TrainConfig) -> Agent:

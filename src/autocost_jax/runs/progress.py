@@ -116,13 +116,17 @@ def stage_lines(config: SearchConfig, stage: int, result: StageResult) -> list[s
       stage: counted from 0.
       result: of the stage.
     """
-    best = int(result.order[0])
+    best = int(np.asarray(result.order)[0])
 
     def cells(scores: Metrics, at: int) -> str:
         return "   ".join(
-            f"{algorithm_label(name)} return {float(scores['ep_return'][a, at]):5.1f} "
-            f"violating {float(scores['violating_worlds'][a, at]):4.0%}"
-            for a, name in enumerate(config.algorithms)
+            f"{algorithm_label(name)} return {ep_return:5.1f} violating {rate:4.0%}"
+            for name, ep_return, rate in zip(
+                config.algorithms,
+                np.asarray(scores["ep_return"])[:, at],
+                np.asarray(scores["violating_worlds"])[:, at],
+                strict=True,
+            )
         )
 
     lines = [f"stage {stage + 1}, the last {config.fitness_epochs} epochs:"]

@@ -259,7 +259,7 @@ def _write_stage(
         searcher.config.algorithms, progress.learners, strict=True
     ):
         policies = searcher.population.fetch(actor(learner.agent))
-        params = jax.tree.map(lambda leaf: leaf[top], policies)
+        params = jax.tree.map(lambda leaf: np.asarray(leaf)[top], policies)
         if run is not None:
             run.write_policy(policy_name(progress.stage, name), flatten(params))
 

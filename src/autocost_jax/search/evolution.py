@@ -24,6 +24,7 @@ from autocost_jax.population import (
     jit_bundle,
     make_agents,
     make_population,
+    run_compiled,
 )
 from autocost_jax.records import Key, Metrics, Slot
 from autocost_jax.search.stages import (
@@ -309,7 +310,8 @@ def require_survivors(config: SearchConfig, state: ESState) -> None:
     Raises:
       RuntimeError: if all candidates of a stage failed; it names the stage.
     """
-    stage = int(es_lib.failed_stage(state, config.population_size))
+    size = config.population_size
+    stage = int(run_compiled(es_lib.failed_stage, state, population_size=size))
     if stage >= 0:
         raise RuntimeError(
             f"every candidate of stage {stage + 1} failed "
@@ -326,6 +328,10 @@ def best_of(config: SearchConfig, state: ESState) -> es_lib.Best:
     require_survivors(config, state)
     if not int(state.generation):
         raise RuntimeError("the search has no best candidate before its first stage")
-    return es_lib.best(
-        state, config.population_size, config.zero_tolerance, config.pool_scores
+    return run_compiled(
+        es_lib.best,
+        state,
+        population_size=config.population_size,
+        zero_tolerance=config.zero_tolerance,
+        pool_scores=config.pool_scores,
     )

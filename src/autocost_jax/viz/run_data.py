@@ -4,13 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.config import SearchConfig
 from autocost_jax.es import Fitness, pool, rank
 from autocost_jax.evaluate import Recording
 from autocost_jax.files import RunDirError, load_arrays
+from autocost_jax.population import run_compiled
 from autocost_jax.runs.directory import list_stages, read_config, read_metrics
 from autocost_jax.runs.labels import COST_LABELS, algorithm_label
 from autocost_jax.search.evolution import pick_label
@@ -167,14 +167,15 @@ def _best(
     """
     if not stages or not all(stage.finite.any() for stage in stages):
         return None
-    theta, judged, returns = (
-        jnp.concatenate([jnp.asarray(getattr(stage, name)) for stage in stages])
-        for name in ("theta", "judged", "ep_return")
-    )
-    fitness = Fitness(judged, returns)
+
+    def joined(name: str) -> Any:
+        return np.concatenate([getattr(stage, name) for stage in stages])
+
+    fitness = Fitness(joined("judged"), joined("ep_return"))
     if config.pool_scores:
-        fitness = pool(theta, fitness)
-    first = int(rank(fitness, config.zero_tolerance)[0])
+        fitness = run_compiled(pool, joined("theta"), fitness)
+    tolerance = config.zero_tolerance
+    first = int(run_compiled(rank, fitness, zero_tolerance=tolerance)[0])
     number, index = divmod(first, config.population_size)
     number, index = card.get("stage", number), card.get("index", index)
     stage = stages[number]

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.config import EnvConfig
@@ -16,6 +15,7 @@ from autocost_jax.envs.layout import make_arena, sample_layout
 from autocost_jax.envs.physics.models import load_spec, mujoco, scene_model
 from autocost_jax.envs.sensors import lidar
 from autocost_jax.evaluate import Recording
+from autocost_jax.population import run_compiled
 from autocost_jax.records import Key, Layout
 from autocost_jax.viz.replay import Kind, Replay, Shape
 
@@ -223,25 +223,27 @@ def lidar_readings(
         rows = [scene.model.body(f"vase{i}").id - 1 for i in range(config.vases_num)]
         targets["vases"] = poses[:, rows, :2]
 
-    def see(objects: Any, position: Any, rotation: Any) -> jax.Array:
-        return lidar(
-            objects,
-            position,
-            rotation,
-            num_bins=config.lidar_num_bins,
-            max_dist=config.lidar_max_dist,
-            exp_gain=config.lidar_exp_gain,
-            alias=config.lidar_alias,
-        )
-
     robot = np.asarray(poses[:, scene.robot], np.float32)
     position, rotation = robot[:, :3], _rotations(robot[:, 3:])
+    settings = {
+        "num_bins": config.lidar_num_bins,
+        "max_dist": config.lidar_max_dist,
+        "exp_gain": config.lidar_exp_gain,
+        "alias": config.lidar_alias,
+    }
     return {
         name: np.asarray(
-            jax.vmap(see)(jnp.asarray(objects, np.float32), position, rotation)
+            run_compiled(
+                _lidars, np.asarray(objects, np.float32), position, rotation, **settings
+            )
         )
         for name, objects in targets.items()
     }
+
+
+def _lidars(objects: Any, position: Any, rotation: Any, **settings: Any) -> jax.Array:
+    """[F, n] what is seen of objects [F, M, 2] from each pose."""
+    return jax.vmap(lambda *pose: lidar(*pose, **settings))(objects, position, rotation)
 
 
 def _rotations(quaternions: np.ndarray) -> np.ndarray:
