@@ -77,8 +77,12 @@ class Scene(NamedTuple):
 
 def random_layout(config: EnvConfig, key: Key) -> Layout:
     """A fresh layout of a world, without its physics; the key is consumed."""
-    layout, _ = sample_layout(make_arena(config), key, np.float32)
+    layout = run_compiled(_sample_layout, key, config=config)
     return jax.tree.map(np.asarray, layout)
+
+
+def _sample_layout(key: Key, config: EnvConfig) -> Layout:
+    return sample_layout(make_arena(config), key, np.float32)[0]
 
 
 def at_rest(scene: Scene, layout: Layout) -> Recording:
