@@ -67,13 +67,25 @@ def test_train_resumes_with_another_population_chunk(trained, asked):
         assert run.config == table
 
 
-def test_train_resumed_with_another_setting_is_refused(trained, capsys):
+@pytest.mark.parametrize(
+    ("flags", "old", "new"),
+    [
+        (["--num-worlds", "4"], "train.num_worlds=2", "train.num_worlds=4"),
+        (["--limit", "25"], "limit=0.5", "limit=25.0"),
+        (["--cost", "extrinsic"], "cost=extrinsic+safety_margin_2x", "cost=extrinsic"),
+        (["--algorithms", "ppo", "cpo"], "label=ppo_lagrangian", "label=cpo"),
+        (["--num-seeds", "3"], "seeds=[0, 1]", "seeds=[0, 1, 2]"),
+    ],
+)
+def test_train_resumed_with_another_setting_is_refused(
+    trained, capsys, flags, old, new
+):
     with pytest.raises(SystemExit) as stop:
-        main(["train", "--out", str(trained), "--resume", "--num-worlds", "4"])
+        main(["train", "--out", str(trained), "--resume", *flags])
     assert stop.value.code == 2
     error = capsys.readouterr().err
-    assert "train.num_worlds=2" in error
-    assert "train.num_worlds=4" in error
+    assert old in error
+    assert new in error
 
 
 def test_of_a_flag_given_twice_the_last_wins(trained, asked):

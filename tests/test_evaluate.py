@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from autocost_jax.evaluate import evaluate, run_episodes, score
+from autocost_jax.runs.policies import eval_summary, score_line
 from toys import ARENA, NUM_STEPS, LinearState, linear_agent, make_toy_env
 
 NUM_EPISODES = 6
@@ -102,10 +103,14 @@ def test_failed_episodes_count_for_nothing(state, key):
     assert expected != pytest.approx(violates.mean())
 
 
-def test_no_valid_episode_has_no_violation(state, key):
+def test_of_no_valid_episode_nothing_is_known(state, key):
     env = make_toy_env(fails=lambda layout, age: age > 0)
     agent = linear_agent(env)
     result = evaluate(env, agent, state, key, 2)
     assert result.valid.tolist() == [0.0, 0.0]
-    assert float(result.violation_rate) == 0.0
-    assert np.isfinite(result.ep_return).all()
+    assert np.isnan(result.violation_rate)
+    row = eval_summary(result)
+    assert row["episodes"] == 0
+    known = [name for name, value in row.items() if not np.isnan(value)]
+    assert known == ["episodes"]
+    assert "of no valid episode nothing is known" in score_line("broken", row)

@@ -108,6 +108,11 @@ def test_compiled_programs_are_kept_for_the_next_run(whole, environment):
     assert list(kept.glob("jit_chunk*"))
 
 
+def no_home():
+    """As `Path.home` for a container's user without an entry in passwd."""
+    raise RuntimeError("Could not determine home directory.")
+
+
 def test_compile_cache_can_be_off_elsewhere_or_impossible(monkeypatch, tmp_path):
     before = jax.config.values["jax_compilation_cache_dir"]
     try:
@@ -118,6 +123,10 @@ def test_compile_cache_can_be_off_elsewhere_or_impossible(monkeypatch, tmp_path)
         assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path / "mine")
         (tmp_path / "file").touch()
         monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file" / "x"))
+        assert use_compile_cache(True) is None
+        for name in ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setattr(Path, "home", no_home)
         assert use_compile_cache(True) is None
     finally:
         jax.config.update("jax_compilation_cache_dir", before)

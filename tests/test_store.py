@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import jax
@@ -295,6 +296,27 @@ def test_lock_holds_until_the_other_process_is_killed(run: RunDir) -> None:
         other.kill()
         other.wait()
     RunDir.open(run.path).close()
+
+
+@pytest.mark.parametrize("missing", ["module", "system call"])
+def test_without_locks_a_run_goes_on_with_a_warning(
+    run: RunDir, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    """On some network file systems, and on Windows."""
+
+    def flock(*_: int) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    run.close()
+    without = SimpleNamespace(flock=flock, LOCK_EX=2, LOCK_NB=4)
+    fcntl = None if missing == "module" else without
+    monkeypatch.setattr("autocost_jax.files.fcntl", fcntl)
+    with RunDir.open(run.path) as again:
+        (warning,) = again.warnings
+        assert "without locks" in warning
+        again.log_metrics({"loss": 1.0}, 0)
+    with RunDir.create(run.path, SMOKE, FACTS, overwrite=True) as new:
+        assert "without locks" in new.warnings[0]
 
 
 # Checkpoints

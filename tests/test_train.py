@@ -172,6 +172,14 @@ def test_metrics_leave_failed_steps_out(key):
     assert float(got["failed_worlds"]) == 2
 
 
+def test_what_no_world_has_shown_is_nan(key):
+    """Not 0, which would be the best cost."""
+    trajectory = make_trajectory(key, jnp.zeros((10, 6)))
+    got = episode_metrics(trajectory, trajectory.reward, 10)
+    assert float(got.pop("failed_worlds")) == 6
+    assert np.isnan(list(got.values())).all()
+
+
 def test_nowhere_far_or_near_is_nan(key):
     trajectory = make_trajectory(key, jnp.ones((4, 2)))
     inputs = trajectory.cost_inputs.replace(distance=jnp.full((4, 2), 2.0))

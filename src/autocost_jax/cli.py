@@ -70,12 +70,13 @@ def _train(argv: list[str]) -> None:
           set: any of them by its name, as in `--set hidden_sizes=[64,64]`, once for
             each; `autocost info --preset laptop` lists them.
           env: one of the worlds that `autocost info` lists.
-          algorithms: ppo, ppo_lagrangian, cpo: one method each.
-          cost: terms of the cost bank, such as "extrinsic+0.1*safety_margin_2x".
-          limit: allowed training cost per episode.
+          algorithms: ppo, ppo_lagrangian, cpo: one method each; default: the second.
+          cost: terms of the cost bank, such as "extrinsic+0.1*safety_margin_2x";
+            default: extrinsic.
+          limit: allowed training cost per episode; default: 0.
           theta: cost.npz with the intrinsic network, if the cost uses it; or the name
             of one that `autocost info` lists.
-          num_seeds: seeds 0 ... N - 1.
+          num_seeds: seeds 0 ... N - 1; default: 1.
           out: run directory.
           resume: continue the run in `out` with its own methods and settings, to which
             the other flags default; only population_chunk may be another.
@@ -92,13 +93,11 @@ def _train(argv: list[str]) -> None:
         preset: Literal["laptop", "search", "paper", "smoke"] | None = None
         set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
         env: str | None = None
-        algorithms: tuple[Literal["ppo", "ppo_lagrangian", "cpo"], ...] = (
-            "ppo_lagrangian",
-        )
-        cost: str = "extrinsic"
-        limit: float = 0.0
+        algorithms: tuple[Literal["ppo", "ppo_lagrangian", "cpo"], ...] | None = None
+        cost: str | None = None
+        limit: float | None = None
         theta: Path | None = None
-        num_seeds: int = 1
+        num_seeds: int | None = None
         out: Path = Path("runs/train")
         resume: bool = False
         overwrite: bool = False
@@ -119,22 +118,10 @@ def _train(argv: list[str]) -> None:
     # Before anything of JAX runs:
     group = (options.coordinator, options.num_processes, options.process_id)
     devices = use_devices(options.devices, *group)
-    from autocost_jax.runs.sweep import Method, SweepConfig, run_sweep
+    from autocost_jax.runs.sweep import run_sweep
 
-    if recorded is not None:
-        config = replace(recorded, train=train)
-    else:
-        theta = _theta(options.theta)
-        config = SweepConfig(
-            train=train,
-            methods=tuple(
-                Method(name, name, options.cost, options.limit, theta)
-                for name in options.algorithms
-            ),
-            seeds=tuple(range(options.num_seeds)),
-        )
     run_sweep(
-        config,
+        _table(options, recorded, train),
         options.out,
         resume=options.resume,
         overwrite=options.overwrite,
@@ -159,6 +146,27 @@ def _train_base(options: Any) -> tuple[Any, Any]:
     if recorded is None or options.preset is not None:
         return recorded, preset(options.preset or "laptop").train
     return recorded, recorded.train
+
+
+def _table(options: Any, recorded: Any, train: Any) -> Any:
+    """The `SweepConfig` of the flags; those not given default to the recorded table."""
+    from autocost_jax.runs.sweep import Method, SweepConfig
+
+    names = ("algorithms", "cost", "limit", "theta", "num_seeds")
+    flags = {name: getattr(options, name) for name in names}
+    given = {name: value for name, value in flags.items() if value is not None}
+    if recorded is None:
+        recorded = SweepConfig(methods=(Method("ppo_lagrangian"),))
+    table = replace(recorded, train=train)
+    if not given:
+        return table
+    first = recorded.methods[0]
+    cost, limit = given.get("cost", first.cost), given.get("limit", first.limit)
+    theta = _theta(given["theta"]) if "theta" in given else first.theta
+    algorithms = given.get("algorithms", [row.algorithm for row in recorded.methods])
+    seeds = range(given["num_seeds"]) if "num_seeds" in given else recorded.seeds
+    methods = tuple(Method(name, name, cost, limit, theta) for name in algorithms)
+    return replace(table, methods=methods, seeds=tuple(seeds))
 
 
 def _theta(path: Path | None) -> tuple[float, ...] | None:

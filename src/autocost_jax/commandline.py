@@ -151,23 +151,28 @@ def use_compile_cache(is_wanted: bool) -> Path | None:
       is_wanted: False leaves JAX as it is.
 
     Returns:
-      The directory; None if not wanted, or if it cannot be written to.
+      The directory; None if not wanted, or if there is none that can be written to.
     """
     import jax
 
     if not is_wanted:
         return None
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    default = Path(base) / "autocost_jax"
-    path = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or default)
     try:
+        path = _cache_directory()
         path.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # the latter: a user without a home
         return None
     if not os.access(path, os.W_OK):
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
     return path
+
+
+def _cache_directory() -> Path:
+    if path := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return Path(path)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "autocost_jax"
 
 
 def use_devices(

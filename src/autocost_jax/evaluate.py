@@ -136,15 +136,13 @@ def score(episodes: Episodes) -> EvalResult:
     valid = episodes.valid
     ep_cost = jnp.sum(valid * episodes.cost_inputs.cost, axis=0)
     whole = valid[-1]  # validity never comes back within an episode
-    violations = jnp.sum(whole * (ep_cost > 0))
     return EvalResult(
         ep_return=jnp.sum(valid * episodes.reward, axis=0),
         ep_cost=ep_cost,
         distance_travelled=episodes.distance_travelled,
         outside_share=episodes.steps_outside / valid.shape[0],
         valid=whole,
-        # A count of episodes: the floor only keeps 0 / 0 away.
-        violation_rate=violations / jnp.maximum(jnp.sum(whole), 1.0),
+        violation_rate=jnp.sum(whole * (ep_cost > 0)) / jnp.sum(whole),
     )
 
 

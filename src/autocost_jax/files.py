@@ -7,7 +7,6 @@ flushed to the disk, and renamed last. Pytrees are stored as flat tables
 
 import contextlib
 import errno
-import fcntl
 import io
 import os
 import shutil
@@ -20,6 +19,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 TEMPORARY = ".tmp-"  # prefix of everything that a kill may leave behind
 _DISK_FULL = "No space left on device"  # tensorstore has no errno, only this text
@@ -270,21 +274,42 @@ def _check_names(got: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
             raise RunDirError(f"array {names[0]} {problem}; expected: {allowed}")
 
 
-def lock_directory(path: Path) -> int:
-    """Take the lock of a directory, made if need be; the kernel frees it on a kill."""
+def lock_directory(path: Path) -> tuple[int, bool]:
+    """Take the lock of a directory, made if need be; the kernel frees it on a kill.
+
+    Returns:
+      A file descriptor that holds the lock until it is closed; and whether it does,
+      which some file systems and Windows do not offer.
+
+    Raises:
+      RunDirError: another process holds it, or the directory cannot be written.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
         handle = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
     except OSError as error:
         raise RunDirError(f"{path} cannot be written: {error.strerror}") from None
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        is_locked = _lock(handle)
         os.ftruncate(handle, 0)
-        os.pwrite(handle, f"pid {os.getpid()} on {socket.gethostname()}".encode(), 0)
+        os.write(handle, f"pid {os.getpid()} on {socket.gethostname()}".encode())
     except OSError as error:
-        holder = os.pread(handle, 200, 0).decode(errors="replace")
+        holder = os.read(handle, 200).decode(errors="replace")
         os.close(handle)
         if isinstance(error, BlockingIOError):
             raise RunDirError(f"{path} is in use by {holder or 'a process'}") from None
         raise RunDirError(f"{path} cannot be locked: {error.strerror}") from None
-    return handle
+    return handle, is_locked
+
+
+def _lock(handle: int) -> bool:
+    """Whether there was a lock to take; an error if another process holds it."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP):
+            return False
+        raise
+    return True

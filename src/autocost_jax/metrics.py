@@ -16,17 +16,24 @@ def episode_metrics(
     `ep_return`, `ep_cost` (extrinsic) and `ep_total_cost` (what the learner sees) are
     undiscounted episode sums, estimated as episode_length x the mean over valid steps:
     for whole episodes exactly their mean. `violating_worlds` is the share of worlds
-    with an extrinsic cost > 0 in this epoch, `failed_worlds` their number.
+    with an extrinsic cost > 0 in this epoch, of those that made a valid step;
+    `failed_worlds` is the number of those that failed. What none has shown is NaN.
     """
     cost, valid = trajectory.cost_inputs.cost, trajectory.valid
-    world_cost = jnp.sum(valid * cost, axis=0)
+    violating = (jnp.sum(valid * cost, axis=0) > 0).astype(valid.dtype)
     return {
-        "ep_return": episode_length * weighted_mean(trajectory.reward, valid),
-        "ep_cost": episode_length * weighted_mean(cost, valid),
-        "ep_total_cost": episode_length * weighted_mean(total, valid),
-        "violating_worlds": jnp.mean((world_cost > 0).astype(valid.dtype)),
+        "ep_return": episode_length * mean_of(trajectory.reward, valid),
+        "ep_cost": episode_length * mean_of(cost, valid),
+        "ep_total_cost": episode_length * mean_of(total, valid),
+        "violating_worlds": mean_of(violating, valid[0]),
         "failed_worlds": jnp.sum(1.0 - valid[-1]),
     }
+
+
+def mean_of(values: jax.Array, weight: jax.Array) -> jax.Array:
+    """Mean of all elements with weight 1; NaN if there is none, unlike a learner's."""
+    known = jnp.sum(weight) > 0
+    return jnp.where(known, weighted_mean(values, weight), jnp.nan)
 
 
 def cost_by_distance(trajectory: Trajectory, theta: jax.Array) -> Metrics:
@@ -38,12 +45,8 @@ def cost_by_distance(trajectory: Trajectory, theta: jax.Array) -> Metrics:
     inputs = trajectory.cost_inputs
     cost = intrinsic_cost(theta, inputs.constraint_lidar)
 
-    def mean(where: jax.Array) -> jax.Array:
-        weight = trajectory.valid * where
-        visited = jnp.sum(weight) > 0
-        return jnp.where(visited, weighted_mean(cost, weight), jnp.nan)
-
+    valid, far, near = trajectory.valid, 3.0 * inputs.radius, 1.5 * inputs.radius
     return {
-        "intrinsic_far": mean(inputs.distance > 3.0 * inputs.radius),
-        "intrinsic_near": mean(inputs.distance < 1.5 * inputs.radius),
+        "intrinsic_far": mean_of(cost, valid * (inputs.distance > far)),
+        "intrinsic_near": mean_of(cost, valid * (inputs.distance < near)),
     }

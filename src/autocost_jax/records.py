@@ -203,7 +203,7 @@ class EvalResult(struct.PyTreeNode):
       distance_travelled: [E] path length of each episode, metres.
       outside_share: [E] share of the steps outside the arena.
       valid: [E] 1.0 where no number of the episode was non-finite.
-      violation_rate: [] share of valid episodes with `ep_cost` > 0.
+      violation_rate: [] share of valid episodes with `ep_cost` > 0; NaN without any.
     """
 
     ep_return: jax.Array

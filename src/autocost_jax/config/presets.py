@@ -12,7 +12,7 @@ _LAPTOP_AGENT = AgentConfig(
     policy_output_scale=0.01,
     gae_lambda=0.95,
     cost_gae_lambda=0.95,
-    target_kl=0.02,
+    target_kl=0.03,
     policy_passes=4,
     policy_minibatches=8,
     value_passes=4,
@@ -20,7 +20,7 @@ _LAPTOP_AGENT = AgentConfig(
     multiplier_init=1.0,
     multiplier_lr=0.01,
     cg_iterations=5,
-    violation_factor=1.35,
+    violation_factor=1.5,
 )
 
 # Long stages rather than many (`experiments/fitness.py`), a start among costs of which
@@ -50,7 +50,7 @@ PRESETS: dict[str, SearchConfig] = {
         num_stages=2,
         fitness_epochs=12,
         num_finalists=4,
-        final_epochs=100,
+        final_epochs=90,
         **_GUIDED,
     ),
     "search": SearchConfig(

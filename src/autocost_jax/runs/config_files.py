@@ -278,6 +278,7 @@ def _difference(old: dict, new: dict, name: str) -> tuple[str, Any, Any] | None:
         a, b = old.get(key), new.get(key)
         if key in MAY_DIFFER:
             continue
+        a, b = _by_place(a), _by_place(b)
         if isinstance(a, dict) and isinstance(b, dict):
             found = _difference(a, b, _join(name, key))
             if found is not None:
@@ -287,8 +288,14 @@ def _difference(old: dict, new: dict, name: str) -> tuple[str, Any, Any] | None:
     return None
 
 
+def _by_place(value: Any) -> Any:
+    """A list of dicts, such as a table's methods, as a dict."""
+    is_table = isinstance(value, list) and value and isinstance(value[0], dict)
+    return {f"[{i}]": row for i, row in enumerate(value)} if is_table else value
+
+
 def _join(name: str, key: Any) -> str:
-    return f"{name}.{key}" if name else str(key)
+    return f"{name}.{key}".replace(".[", "[") if name else str(key)
 
 
 def _encode(value: Any, hint: Any, name: str) -> Any:

@@ -93,14 +93,19 @@ class RunDir:
     """
 
     def __init__(
-        self, path: Path, config: Any, facts: dict, lock: int, digest: str
+        self, path: Path, config: Any, facts: dict, lock: tuple[int, bool], digest: str
     ) -> None:
         self.path = path
         self.config = config
         self.facts = facts
         self.warnings: list[str] = []
         self._hash = digest  # of the recorded config, which its checkpoints carry
-        self._lock = lock
+        self._lock, is_locked = lock
+        if not is_locked:
+            self.warnings.append(
+                f"{path} is on a file system without locks: nothing keeps a second "
+                "process out of it"
+            )
         self._metrics: FileIO | None = None
         self._events: Any = None
 
@@ -137,7 +142,7 @@ class RunDir:
                 remove(old)
             write_atomic(path / CONFIG, text.encode())
         except BaseException:
-            os.close(lock)
+            os.close(lock[0])
             raise
         return cls(path, config, facts, lock, config_hash(config))
 

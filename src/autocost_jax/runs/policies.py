@@ -192,6 +192,8 @@ def eval_summary(result: EvalResult) -> dict[str, float | int]:
 
 def score_line(label: str, row: dict[str, Any]) -> str:
     """One row of `eval_summary` for people."""
+    if not row["episodes"]:
+        return f"{label}: of no valid episode nothing is known"
     return (
         f"{label}: return {row['return_mean']:.2f} +- {row['return_ci']:.2f}, "
         f"extrinsic cost {row['cost_mean']:.3f} +- {row['cost_ci']:.3f}, "

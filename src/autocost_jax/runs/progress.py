@@ -101,11 +101,17 @@ def summarise(
         stage="finalists" if is_final else f"{stage + 1}/{config.num_stages}",
         epoch=epochs_done,
         num_epochs=config.epochs_of(stage),
-        cost=float(np.median(cost[:, :count].mean((0, 2)))),
-        ep_return=float(np.median(ep_return[:, :count].mean((0, 2)))),
-        violating=float(violating[:, :count].mean()),
+        cost=_over_known(np.median, cost[:, :count].mean((0, 2))),
+        ep_return=_over_known(np.median, ep_return[:, :count].mean((0, 2))),
+        violating=_over_known(np.mean, violating[:, :count]),
         reference=reference,
     )
+
+
+def _over_known(function: Callable[..., Any], values: np.ndarray) -> float:
+    """Of those values that are not NaN; NaN if all are."""
+    known = values[~np.isnan(values)]
+    return float(function(known)) if known.size else math.nan
 
 
 def stage_lines(config: SearchConfig, stage: int, result: StageResult) -> list[str]:
