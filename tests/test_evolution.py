@@ -181,6 +181,12 @@ def test_the_same_seed_twice(searcher, events):
     assert_same_bits(run(searcher=searcher)[-1][0], events[-1][0])
 
 
+def test_keys_are_not_of_the_users_generator():
+    with jax.default_prng_impl("rbg"):
+        root = make_searcher(CONFIG).root
+    assert jax.random.key_impl(root) == "threefry2x32"
+
+
 def test_another_seed_is_another_search(events):
     other = run(dataclasses.replace(CONFIG, seed=1, num_stages=1))
     assert not np.isin(other[-1][0].candidates, events[5][0].candidates).any()

@@ -157,6 +157,23 @@ def test_a_terminal_gets_a_table_with_one_row_a_stage(summary, monkeypatch):
         assert name in last
 
 
+@pytest.mark.parametrize(
+    ("stream", "variable", "value"),
+    [(Terminal, "TERM", "dumb"), (io.StringIO, "FORCE_COLOR", "1")],
+)
+def test_what_cannot_redraw_gets_plain_lines(
+    summary, monkeypatch, stream, variable, value
+):
+    monkeypatch.setenv(variable, value)
+    text = stream()
+    with Display(1000, 0, text) as display:
+        display.start_clock()
+        display.update(summary, 250)
+        display.update(summary, 250)
+    assert text.getvalue().count("stage 2/3") == 2
+    assert "\x1b" not in text.getvalue()
+
+
 def test_rate_and_time_left_count_only_this_process(summary, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("autocost_jax.runs.progress.time.monotonic", lambda: now[0])

@@ -28,7 +28,7 @@ from autocost_jax.population import (
     remake_empty,
     stack_slots,
 )
-from autocost_jax.records import EnvState, Slot
+from autocost_jax.records import EnvState, Slot, root_key
 
 REPEATS = 3
 STEPS = {"Point": 50, "Car": 10, "Doggo": 5}  # of each world in a timed call
@@ -125,8 +125,8 @@ def env_speed(
         jax.shard_map, mesh=mesh, in_specs=split, out_specs=split, check_vma=False
     )
     num_steps = STEPS[config.robot]
-    keys = jax.random.split(jax.random.key(0), batch)
-    each = jax.random.split(jax.random.key(1), len(devices))
+    keys = jax.random.split(root_key(0), batch)
+    each = jax.random.split(root_key(1), len(devices))
     reset = jax.jit(shard(jax.vmap(env.reset)))
     worlds = jax.block_until_ready(reset(keys))
     program = jax.jit(shard(functools.partial(_random_steps, env, num_steps)))
@@ -365,7 +365,7 @@ def _slots(size: int) -> Slot:
     """Slots [size] of the extrinsic cost alone, one seed each."""
     cost = training_cost("extrinsic", limit=0.0)
     ones = jnp.ones((), jnp.float32)
-    return stack_slots([Slot(cost, jax.random.key(i), ones) for i in range(size)])
+    return stack_slots([Slot(cost, root_key(i), ones) for i in range(size)])
 
 
 def _random_steps(

@@ -207,6 +207,7 @@ def _evaluate(argv: list[str]) -> None:
     from autocost_jax.envs.env import make_env
     from autocost_jax.files import write_atomic
     from autocost_jax.population import make_evaluator
+    from autocost_jax.records import root_key
     from autocost_jax.runs.config_files import to_json
     from autocost_jax.runs.policies import (
         EVALUATION,
@@ -221,7 +222,7 @@ def _evaluate(argv: list[str]) -> None:
     env = make_env(config.train.env)
     agent, states = load_policies(env, config.train, files)
     run = make_evaluator(env, agent, options.episodes, options.deterministic)
-    key = jax.random.fold_in(jax.random.key(options.seed), EVALUATION)
+    key = jax.random.fold_in(root_key(options.seed), EVALUATION)
     results, _ = run(states, key)
     rows = []
     for i, file in enumerate(files):

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from autocost_jax.config import SearchConfig
-from autocost_jax.records import Key
+from autocost_jax.records import Key, root_key
 
 
 class Fitness(struct.PyTreeNode):
@@ -260,7 +260,7 @@ def truncation_es(
     order = rank or _paper_rank(config)
 
     def start() -> ESState:
-        shapes = jax.eval_shape(first, jax.random.key(0))
+        shapes = jax.eval_shape(first, root_key(0))
         return _empty_state(shapes, elites, config.num_stages * size)
 
     def ask(key: Key, state: ESState) -> Any:

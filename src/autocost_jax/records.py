@@ -20,6 +20,15 @@ Key = jax.Array
 Metrics = dict[str, jax.Array]
 
 
+def root_key(seed: int) -> Key:
+    """The key of a seed, of JAX's own generator whatever the user's default is.
+
+    Under `vmap` others draw what depends on the lanes beside: the candidates of a stage
+    would not meet the same layouts.
+    """
+    return jax.random.key(seed, impl="threefry2x32")
+
+
 class Layout(struct.PyTreeNode):
     """Where everything stands at the start of an episode, world frame.
 

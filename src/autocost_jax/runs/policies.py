@@ -14,7 +14,7 @@ from autocost_jax.config import TrainConfig
 from autocost_jax.envs.env import Env
 from autocost_jax.files import RunDirError, load_arrays, unflatten
 from autocost_jax.population import make_agents
-from autocost_jax.records import EvalResult, Key
+from autocost_jax.records import EvalResult, Key, root_key
 
 EVALUATION = 2**31 - 1  # purpose of the final evaluation's key, beyond any stage
 
@@ -66,7 +66,7 @@ def policy_states(env: Env, train: TrainConfig, actors: Actor) -> tuple[Agent, A
 
 def _shapes(agent: Agent) -> Any:
     """Of the state of one agent."""
-    return jax.eval_shape(agent.init, jax.random.key(0))
+    return jax.eval_shape(agent.init, root_key(0))
 
 
 def _acting_agent(env: Env, train: TrainConfig) -> Agent:

@@ -171,7 +171,8 @@ class Display:
         from rich.console import Console
 
         self._console = Console(file=stream)
-        self._is_live = self._console.is_terminal
+        # FORCE_COLOR makes rich take a file for a terminal.
+        self._is_live = stream.isatty() and not self._console.is_dumb_terminal
         self._live: Any = None
         self._total, self._done = total_steps, done_steps
         self._made = time.monotonic()

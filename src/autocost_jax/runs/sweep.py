@@ -28,7 +28,7 @@ from autocost_jax.population import (
     make_population,
     stack_slots,
 )
-from autocost_jax.records import Slot
+from autocost_jax.records import Slot, root_key
 from autocost_jax.runs import cluster
 from autocost_jax.runs.directory import RunDir, open_run
 from autocost_jax.runs.loop import (
@@ -151,7 +151,7 @@ def sweep_slots(config: SweepConfig) -> tuple[Slot, ...]:
         theta = unused if method.theta is None else np.asarray(method.theta)
         return Slot(
             cost=training_cost(method.cost, theta, method.limit),
-            key=jax.random.key(seed),
+            key=root_key(seed),
             constrained=jnp.asarray(method.algorithm != "ppo", jnp.float32),
         )
 
@@ -287,7 +287,7 @@ def _finish(
                 display.say(f"{stem} met a non-finite number in epoch {frozen}")
     display.say(f"evaluating {len(files)} policies over {num_episodes} episodes ...")
     agent, states = load_policies(env, config.train, files)
-    key = jax.random.key(EVALUATION)
+    key = root_key(EVALUATION)
     results, _ = make_evaluator(env, agent, num_episodes)(states, key)
     for i, row in enumerate(table):
         row |= eval_summary(jax.tree.map(lambda x, i=i: x[i], results))

@@ -26,7 +26,7 @@ from autocost_jax.population import (
     make_population,
     run_compiled,
 )
-from autocost_jax.records import Key, Metrics, Slot
+from autocost_jax.records import Key, Metrics, Slot, root_key
 from autocost_jax.search.stages import (
     TRACKED,
     StageFunctions,
@@ -178,7 +178,7 @@ def make_searcher(
     """Build the program of a search; nothing is compiled yet."""
     env = make_env(config.train.env)
     agents = make_agents(config.algorithms, config.train, env)
-    root = jax.random.key(config.seed)
+    root = root_key(config.seed)
     return Searcher(
         config=config,
         env=env,

@@ -18,7 +18,7 @@ from autocost_jax.config import SearchConfig
 from autocost_jax.costs import BANK, CostTerm, training_cost
 from autocost_jax.envs.env import Env
 from autocost_jax.es import ES, ESState, Fitness, truncation_es
-from autocost_jax.records import Key, Metrics, Slot, TrainingCost
+from autocost_jax.records import Key, Metrics, Slot, TrainingCost, root_key
 from autocost_jax.rollout import typical_lidars
 from autocost_jax.search.starts import graded_start
 from autocost_jax.search.success import shortfall
@@ -292,7 +292,7 @@ def make_strategy(config: SearchConfig, env: Env) -> ES:
         return truncation_es(config)
 
     def start(key: Key) -> jax.Array:
-        lidars = typical_lidars(env, jax.random.key(0))
+        lidars = typical_lidars(env, root_key(0))
         size, std = config.population_size, config.init_std
         return graded_start(key, size, std, lidars, config.network)
 

@@ -15,6 +15,7 @@ from autocost_jax.envs.env import make_env
 from autocost_jax.evaluate import first_recording, watch_first
 from autocost_jax.files import load_arrays, unflatten
 from autocost_jax.population import make_agents, make_evaluator
+from autocost_jax.records import root_key
 from autocost_jax.runs.policies import policy_states
 from autocost_jax.viz.cost_map import network_cost
 from autocost_jax.viz.report import write_comparison
@@ -56,7 +57,7 @@ def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
     train = demo_train()
     env = make_env(train.env)
     (agent,) = make_agents(("cpo",), train, env)
-    like = actor(agent.init(jax.random.key(0)))
+    like = actor(agent.init(root_key(0)))
     folder = resources.files("autocost_jax") / "pretrained" / "policies"
     loaded = [
         unflatten(load_arrays(Path(str(folder / f"{name}_cpo.npz")), None), like)
@@ -66,7 +67,7 @@ def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
         env, train, jax.tree.map(lambda *leaves: np.stack(leaves), *loaded)
     )
     evaluate = make_evaluator(env, acting, num_episodes, watch=watch_first)
-    result, episodes = evaluate(states, jax.random.key(seed))
+    result, episodes = evaluate(states, root_key(seed))
     theta = np.asarray(load_cost(FOUND))
     replays, lines = [], []
     for i, (name, label) in enumerate(LABELS.items()):

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from autocost_jax.config import EnvConfig, env_config
 from autocost_jax.envs.env import Env, make_env
 from autocost_jax.evaluate import Recording
 from autocost_jax.files import write_atomic
+from autocost_jax.records import root_key
 from autocost_jax.viz.markup import asset, escape, fill
 from autocost_jax.viz.picture import Job, draw, why_not
 from autocost_jax.viz.replay import Shape
@@ -61,7 +61,7 @@ def write_gallery(names: Sequence[str], out: Path, seed: int = 0) -> Gallery:
     jobs = []
     for name, config in zip(names, configs, strict=True):
         scene = make_scene(config)
-        moment = at_rest(scene, random_layout(config, jax.random.key(seed)))
+        moment = at_rest(scene, random_layout(config, root_key(seed)))
         job = Job(config, moment, out / f"{name}{suffix}", SIZE, camera="fixed")
         if hint is not None:
             write_atomic(job.path, top_view(scene, moment).encode())

@@ -16,6 +16,7 @@ from autocost_jax.envs.env import Env, make_env
 from autocost_jax.evaluate import Recording, first_recording, watch_first
 from autocost_jax.files import load_arrays, write_atomic
 from autocost_jax.population import make_evaluator
+from autocost_jax.records import root_key
 from autocost_jax.runs.policies import (
     EVALUATION,
     load_policies,
@@ -75,7 +76,7 @@ def script_player(env: str, policy: str) -> Player:
 
     def make_agent(world: Env) -> tuple[Agent, Any]:
         agent = scripted_agent(policy, world)
-        return agent, agent.init(jax.random.key(0))
+        return agent, agent.init(root_key(0))
 
     page = Path("runs/replays") / f"{env}-{policy}.html"
     return Player(env, config, policy, "scripted", make_agent, page)
@@ -135,7 +136,7 @@ def record_episode(player: Player, seed: int) -> Recording:
     agent, state = player.make_agent(env)
     is_mean = player.actions == "mean"
     run = make_evaluator(env, agent, 1, is_mean, watch=watch_first)
-    key = jax.random.fold_in(jax.random.key(seed), EVALUATION)
+    key = jax.random.fold_in(root_key(seed), EVALUATION)
     _, episodes = run(jax.tree.map(lambda leaf: leaf[None], state), key)
     return first_recording(jax.tree.map(lambda leaf: leaf[0], episodes))
 
