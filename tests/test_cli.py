@@ -180,6 +180,12 @@ def test_slots_of_a_table_follow_its_rows():
         SweepConfig(methods=(Method("a"), Method("a")))
 
 
+@pytest.mark.parametrize("label", ["", "../../x", "a/b", ".hidden", "a\\b", "a\n"])
+def test_a_label_names_a_file_within_the_run(label):
+    with pytest.raises(ValueError, match="name of a file"):
+        Method(label)
+
+
 def test_networks_of_a_table_have_one_size():
     """Slots are stacked; one without a network takes the size of the others."""
     cost = "extrinsic+intrinsic"

@@ -109,6 +109,13 @@ TERMS = {
 }
 
 
+@pytest.mark.parametrize(("size", "bins"), [(41, 16), (40, 8), (13, 1), (77, 16)])
+def test_the_network_reads_eight_bins_and_no_others(size, bins):
+    """Of sixteen it would read those ahead and to one side alone."""
+    with pytest.raises(ValueError, match=f"{size} parameters and {bins} bins"):
+        jax.eval_shape(intrinsic_cost, jnp.zeros(size), jnp.zeros((5, bins)))
+
+
 def test_the_bank_has_these_terms():
     assert [term.name for term in BANK] == list(TERMS)
 

@@ -298,6 +298,23 @@ def test_lock_holds_until_the_other_process_is_killed(run: RunDir) -> None:
     RunDir.open(run.path).close()
 
 
+@pytest.mark.parametrize("name", ["lock", "metrics.jsonl"])
+def test_nothing_is_written_through_a_link(
+    run: RunDir, tmp_path: Path, name: str
+) -> None:
+    run.close()
+    (run.path / name).unlink(missing_ok=True)
+    mine = tmp_path / "thesis.txt"
+    mine.write_text("mine")
+    (run.path / name).symlink_to(mine)
+    with (
+        pytest.raises(RunDirError, match=f"{name} is a link"),
+        RunDir.open(run.path) as again,
+    ):
+        again.truncate_metrics(0)
+    assert mine.read_text() == "mine"
+
+
 @pytest.mark.parametrize("missing", ["module", "system call"])
 def test_without_locks_a_run_goes_on_with_a_warning(
     run: RunDir, monkeypatch: pytest.MonkeyPatch, missing: str

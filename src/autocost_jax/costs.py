@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from autocost_jax.config import THETA_SIZES
+from autocost_jax.config import LIDAR_BINS, THETA_SIZES
 from autocost_jax.files import load_arrays
 from autocost_jax.records import CostInputs, TrainingCost
 
@@ -62,7 +62,16 @@ def intrinsic_logit(theta: jax.Array, lidar: jax.Array) -> jax.Array:
     highest of the eight readings as its only input, which the distance D of the closest
     object decides: exp(-D). It can say what a safety margin says, and cannot be silent
     on one side of the robot.
+
+    Raises:
+      ValueError: another number of parameters, or of bins.
     """
+    sizes = (theta.shape[-1], lidar.shape[-1])
+    if sizes[0] not in THETA_SIZES.values() or sizes[1] != LIDAR_BINS:
+        raise ValueError(
+            f"the cost network has {_SIZES} parameters and reads {LIDAR_BINS} bins, "
+            f"got {sizes[0]} parameters and {sizes[1]} bins"
+        )
     split = theta.shape[-1] - 2 * HIDDEN - 1
     w1 = theta[:split].reshape(-1, HIDDEN)
     b1, w2, b2 = theta[split : split + HIDDEN], theta[split + HIDDEN : -1], theta[-1]

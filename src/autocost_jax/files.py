@@ -274,6 +274,12 @@ def _check_names(got: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
             raise RunDirError(f"array {names[0]} {problem}; expected: {allowed}")
 
 
+def require_no_link(file: Path) -> None:
+    """Refuse to write through a link, which may lead anywhere."""
+    if file.is_symlink():
+        raise RunDirError(f"{file} is a link: it is not written through")
+
+
 def lock_directory(path: Path) -> tuple[int, bool]:
     """Take the lock of a directory, made if need be; the kernel frees it on a kill.
 
@@ -282,8 +288,10 @@ def lock_directory(path: Path) -> tuple[int, bool]:
       which some file systems and Windows do not offer.
 
     Raises:
-      RunDirError: another process holds it, or the directory cannot be written.
+      RunDirError: another process holds it, it is a link, or the directory cannot be
+        written.
     """
+    require_no_link(path / "lock")
     try:
         path.mkdir(parents=True, exist_ok=True)
         handle = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o644)

@@ -380,7 +380,9 @@ def _from_json(value: Any) -> Any:
 
 def _commit() -> str | None:
     """Commit of the repository the user stands in, "-dirty" if it was changed."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    # A repository may name a program that watches its files: it is not to be trusted.
+    command = ["git", "-c", "core.fsmonitor=false", "describe", "--always", "--dirty"]
+    command += ["--abbrev=40", "--exclude=*"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=10)
     except (OSError, subprocess.TimeoutExpired):

@@ -35,6 +35,7 @@ from autocost_jax.files import (
     lock_directory,
     remove,
     remove_temporaries,
+    require_no_link,
     save_arrays,
     write_atomic,
 )
@@ -237,6 +238,7 @@ class RunDir:
         with disk_errors(self.path / METRICS):
             if self._metrics is None:
                 # Unbuffered: what a full disk refused must not come back in close().
+                require_no_link(self.path / METRICS)
                 self._metrics = (self.path / METRICS).open("ab", buffering=0)
             _append(self._metrics, line.encode() + b"\n")
             if self._events is None:
@@ -300,6 +302,7 @@ class RunDir:
         if self._metrics is not None:
             self._metrics.close()
             self._metrics = None
+        require_no_link(file)
         length = file.stat().st_size if file.exists() else 0
         if length < metrics_bytes:
             return f"{file} lost {metrics_bytes - length} bytes since the checkpoint"

@@ -5,6 +5,7 @@ The run directory holds the configuration, metrics, checkpoints, the policy of e
 slot and their scores over fresh episodes.
 """
 
+import re
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -73,6 +74,11 @@ class Method:
     theta: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        if not re.fullmatch(r"[^./\\\0-\x1f][^/\\\0-\x1f]{0,99}", self.label):
+            raise ValueError(
+                "label must be the name of a file, of at most 100 characters and not "
+                f"with a dot first, got {self.label!r}"
+            )
         if self.algorithm not in ("ppo", *GROUPS):
             raise ValueError(
                 f"algorithm must be ppo, ppo_lagrangian or cpo, got {self.algorithm!r}"
