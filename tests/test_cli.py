@@ -2,11 +2,13 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 
 from autocost_jax.cli import main
 from autocost_jax.config import preset
+from autocost_jax.runs import limits
 from autocost_jax.runs.directory import RunDir, read_metrics
 from autocost_jax.runs.sweep import Method, SweepConfig, sweep_slots
 
@@ -145,6 +147,42 @@ def test_bad_input_gets_one_line_and_status_2(argv, words, capsys, tmp_path):
     for word in words:
         assert word in error
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([*TRAIN, "--num-worlds", "20000000"], ["the training needs", "GB"]),
+        ([*TRAIN, "--episodes", "200000000"], ["200000000 episodes needs", "GB"]),
+        (["evaluate", "--episodes", "200000000"], ["200000000 episodes needs", "GB"]),
+    ],
+)
+def test_what_cannot_fit_is_refused_before_anything_is_written(
+    argv, words, capsys, tmp_path, trained
+):
+    train = argv[0] == "train"
+    argv = [*argv, *(["--out", str(tmp_path / "run")] if train else [])]
+    argv = argv if train else [*argv, "--run", str(trained)]
+    with pytest.raises(SystemExit) as stop:
+        main(argv)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    for word in words:
+        assert word in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_job_has_less_memory_than_its_machine(monkeypatch, tmp_path):
+    """A limit of a container counts, the word `max` does not."""
+    files = [tmp_path / "max", tmp_path / "limit", tmp_path / "missing"]
+    files[0].write_text("max\n")
+    monkeypatch.setattr(limits, "CGROUP_LIMITS", files)
+    machine = limits.memory_of(jax.devices())
+    files[1].write_text("1000000\n")
+    assert limits.memory_of(jax.devices()) == 1_000_000 // len(jax.devices())
+    assert machine is not None
+    assert machine > 1_000_000
 
 
 def test_unknown_policy_lists_those_of_the_run(trained, capsys):

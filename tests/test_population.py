@@ -416,7 +416,8 @@ def test_the_evaluator_plays_the_same_layouts_for_all(key, reference):
     env = make_toy_env()
     agent = make_agents(ALGORITHMS[:1], TRAIN, env)[0]
     states = reference[0][0].agent
-    result, episodes = make_evaluator(env, agent, 5)(states, key)
+    run = make_evaluator(env, agent, 5, keep=lambda episodes: episodes)
+    result, episodes = run(states, key)
     assert result.ep_return.shape == (SIZE, 5)
     assert episodes.reward.shape == (SIZE, env.episode_length, 5)
     start = np.asarray(episodes.start.robot_xy)

@@ -91,7 +91,7 @@ def episode():
         seen = {"obs": worlds.obs[0], "xy": worlds.layout.robot_xy[0]}
         return watch_first(worlds) | seen
 
-    run = make_evaluator(env, agent, 2, watch=watch)
+    run = make_evaluator(env, agent, 2, keep=lambda e: e, watch=watch)
     _, episodes = run(jnp.zeros(1), jax.random.key(0))
     episodes = jax.tree.map(lambda leaf: np.asarray(leaf[0]), episodes)
     return config, env, episodes

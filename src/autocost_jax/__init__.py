@@ -6,6 +6,8 @@ autocost_jax.evolve` is the main job, `autocost --help` lists the other commands
 
 from autocost_jax.agents.base import Agent, AgentState
 from autocost_jax.agents.cpo import cpo
+from autocost_jax.agents.focops import focops
+from autocost_jax.agents.pid_lagrangian import pid_lagrangian
 from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
 from autocost_jax.config import (
     PRESETS,
@@ -82,6 +84,7 @@ __all__ = [
     "env_config",
     "evaluate",
     "evolve",
+    "focops",
     "graded_start",
     "intrinsic_cost",
     "list_costs",
@@ -90,6 +93,7 @@ __all__ = [
     "make_env",
     "make_population",
     "mutate",
+    "pid_lagrangian",
     "pool",
     "ppo_lagrangian",
     "preset",

@@ -17,7 +17,7 @@ from autocost_jax.commandline import (
     use_devices,
     with_flags,
 )
-from autocost_jax.config import TrainConfig
+from autocost_jax.config import AlgorithmName, TrainConfig
 from autocost_jax.showing import demo, envs, render, report, run_config
 
 HELP = """usage: autocost COMMAND [flags]
@@ -70,7 +70,8 @@ def _train(argv: list[str]) -> None:
           set: any of them by its name, as in `--set hidden_sizes=[64,64]`, once for
             each; `autocost info --preset laptop` lists them.
           env: one of the worlds that `autocost info` lists.
-          algorithms: ppo, ppo_lagrangian, cpo: one method each; default: the second.
+          algorithms: ppo, ppo_lagrangian, cpo, focops, pid_lagrangian: one method
+            each; default: the second.
           cost: terms of the cost bank, such as "extrinsic+0.1*safety_margin_2x";
             default: extrinsic.
           limit: allowed training cost per episode; default: 0.
@@ -93,7 +94,7 @@ def _train(argv: list[str]) -> None:
         preset: Literal["laptop", "search", "paper", "smoke"] | None = None
         set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
         env: str | None = None
-        algorithms: tuple[Literal["ppo", "ppo_lagrangian", "cpo"], ...] | None = None
+        algorithms: tuple[AlgorithmName, ...] | None = None
         cost: str | None = None
         limit: float | None = None
         theta: Path | None = None
@@ -209,6 +210,7 @@ def _evaluate(argv: list[str]) -> None:
     from autocost_jax.population import make_evaluator
     from autocost_jax.records import root_key
     from autocost_jax.runs.config_files import to_json
+    from autocost_jax.runs.limits import evaluation_bytes, require_memory
     from autocost_jax.runs.policies import (
         EVALUATION,
         eval_summary,
@@ -220,6 +222,10 @@ def _evaluate(argv: list[str]) -> None:
     config = run_config(options.run)
     files = policy_files(options.run, options.policies)
     env = make_env(config.train.env)
+    need = evaluation_bytes(env, len(files), options.episodes)
+    require_memory(
+        need, f"an evaluation over {options.episodes} episodes", jax.devices()
+    )
     agent, states = load_policies(env, config.train, files)
     run = make_evaluator(env, agent, options.episodes, options.deterministic)
     key = jax.random.fold_in(root_key(options.seed), EVALUATION)

@@ -117,17 +117,16 @@ def watch_first(worlds: EnvState) -> dict[str, jax.Array]:
     return {"qpos": worlds.data.qpos[0], "goal_xy": worlds.layout.goal_xy[0]}
 
 
-def first_recording(episodes: Episodes) -> Recording:
-    """The first of the episodes that `watch_first` has watched."""
-    episodes = jax.tree.map(np.asarray, episodes)
+def first_recording(episodes: Any) -> Recording:
+    """The first of the `Episodes` that `watch_first` has watched, jax or numpy."""
     return Recording(
         qpos=episodes.watched["qpos"],
         goal_xy=episodes.watched["goal_xy"],
-        hazards=np.asarray(episodes.start.hazards[0]),
-        pillars=np.asarray(episodes.start.pillars[0]),
-        reward=np.asarray(episodes.reward[:, 0]),
-        cost=np.asarray(episodes.cost_inputs.cost[:, 0]),
-        constraint_lidar=np.asarray(episodes.cost_inputs.constraint_lidar[:, 0]),
+        hazards=episodes.start.hazards[0],
+        pillars=episodes.start.pillars[0],
+        reward=episodes.reward[:, 0],
+        cost=episodes.cost_inputs.cost[:, 0],
+        constraint_lidar=episodes.cost_inputs.constraint_lidar[:, 0],
     )
 
 

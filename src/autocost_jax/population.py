@@ -18,6 +18,8 @@ from jax.sharding import PartitionSpec as P
 
 from autocost_jax.agents.base import Agent
 from autocost_jax.agents.cpo import cpo
+from autocost_jax.agents.focops import focops
+from autocost_jax.agents.pid_lagrangian import pid_lagrangian
 from autocost_jax.agents.ppo_lagrangian import ppo_lagrangian
 from autocost_jax.config import Algorithm, TrainConfig
 from autocost_jax.costs import BANK, CostTerm
@@ -37,7 +39,12 @@ from autocost_jax.train import (
 AXIS = "slot"
 # It runs once a stage: compiling it took 11 s at level 3 and 2 s at level 1.
 INIT_OPTIONS = {"xla_backend_optimization_level": 1}
-AGENTS: dict[str, Callable[..., Agent]] = {"ppo_lagrangian": ppo_lagrangian, "cpo": cpo}
+AGENTS: dict[Algorithm, Callable[..., Agent]] = {
+    "ppo_lagrangian": ppo_lagrangian,
+    "cpo": cpo,
+    "focops": focops,
+    "pid_lagrangian": pid_lagrangian,
+}
 
 
 class Population(NamedTuple):
@@ -182,23 +189,32 @@ def make_evaluator(
     agent: Agent,
     num_episodes: int,
     deterministic: bool = False,
+    keep: Callable[[Episodes], Any] = lambda episodes: (),
     **options: Any,
-) -> Callable[[Any, Key], tuple[EvalResult, Episodes]]:
+) -> Callable[[Any, Key], tuple[EvalResult, Any]]:
     """Evaluate stacked policies in one compiled call.
 
     All policies meet the same layouts. `agent` may be any algorithm whose `policy`
-    understands the states: PPO-Lagrangian's acts for CPO's, too. Options are those of
-    `run_episodes`.
+    understands the states: PPO-Lagrangian's acts for CPO's, too.
+
+    Args:
+      env: the environment.
+      agent: whose policies they are.
+      num_episodes: E, of each policy.
+      deterministic: act by the mean instead of sampling.
+      keep: what to keep of a policy's episodes beside their scores; all of them fill a
+        memory soon.
+      options: of `run_episodes`.
 
     Returns:
-      (agent states [P, ...], key) -> EvalResult [P, E] and Episodes [P, ...].
+      (agent states [P, ...], key) -> EvalResult [P, E] and what was kept [P, ...].
     """
 
-    def evaluate_one(state: Any, key: Key) -> tuple[EvalResult, Episodes]:
+    def evaluate_one(state: Any, key: Key) -> tuple[EvalResult, Any]:
         episodes = run_episodes(
             env, agent, state, key, num_episodes, deterministic, **options
         )
-        return score(episodes), episodes
+        return score(episodes), keep(episodes)
 
     return jax.jit(jax.vmap(evaluate_one, in_axes=(0, None)))
 

@@ -5,7 +5,7 @@ policy loss and the KL stop tested before a pass instead of after it.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,27 +16,17 @@ from autocost_jax.agents.advantages import weighted_mean
 from autocost_jax.agents.base import (
     Agent,
     AgentState,
-    Batch,
     EnvSizes,
     as_metrics,
     critic_optimizer,
-    global_norm,
     learn_obs,
     make_policy,
     prepare_batch,
-    split_rows,
     start_normalizer,
     update_critics,
 )
-from autocost_jax.agents.blocks import mean_over_blocks
-from autocost_jax.agents.networks import (
-    Networks,
-    Params,
-    entropy,
-    kl_divergence,
-    log_prob,
-    make_networks,
-)
+from autocost_jax.agents.networks import log_prob, make_networks
+from autocost_jax.agents.passes import take_passes
 from autocost_jax.config import AgentConfig
 from autocost_jax.precision import full_precision
 from autocost_jax.records import Key, Metrics, Slot, Trajectory
@@ -101,126 +91,35 @@ def policy_loss(
     return -(gain - multiplier * price) / (1.0 + multiplier)
 
 
-def update_policy(
-    config: AgentConfig,
-    networks: Networks,
-    params: Params,
-    opt_state: Any,
-    batch: Batch,
-    multiplier: jax.Array,
-    key: Key,
-) -> tuple[Params, Any, Metrics]:
-    """The policy after at most `policy_passes` x `policy_minibatches` Adam steps.
+class MultiplierRule(NamedTuple):
+    """How the weight of the cost follows the cost.
 
-    Before each pass the KL of the whole batch is tested at the current parameters;
-    once it exceeds kl_stop_factor * target_kl no further step is taken.
-
-    Args:
-      config: passes, minibatches, learning rate, clip, KL stop.
-      networks: of the agent.
-      params: policy parameters.
-      opt_state: Adam's state.
-      batch: the epoch's rows.
-      multiplier: [] lambda, a constant here.
-      key: consumed; orders the minibatches.
-
-    Returns:
-      Parameters, Adam's state and metrics: `kl`, `policy_loss`, `entropy` at the
-      new parameters, `policy_steps` taken, `policy_grad_norm` at the first step.
+    Attributes:
+      init: () -> (multiplier, memory), pytrees of arrays.
+      step: (multiplier, memory, j_c, limit) -> (multiplier, memory, weight []); once an
+        epoch, before the policy learns.
     """
-    optimizer = optax.adam(config.policy_lr)
-    kl_stop = config.kl_stop_factor * config.target_kl
-    rest = jnp.column_stack(
-        [batch.log_prob_old, batch.advantage, batch.cost_advantage, batch.weight]
-    )
-    rows = (batch.obs, jnp.column_stack([batch.action, rest]))
-    action_size = batch.action.shape[-1]
 
-    def loss_fn(params: Params, rows: Any) -> tuple[jax.Array, Any]:
-        obs, rest = rows
-        mean, log_std = networks.distribution(params, obs)
-        new = log_prob(rest[:, :action_size], mean, log_std)
-        loss = policy_loss(new, rest[:, action_size:], multiplier, config.clip_eps)
-        return loss, (mean, log_std)
+    init: Callable[[], tuple[Any, Any]]
+    step: Callable[..., tuple[Any, Any, jax.Array]]
 
-    def kl_of(
-        distribution: tuple[jax.Array, jax.Array],
-        mean_old: jax.Array,
-        weight: jax.Array,
-    ) -> jax.Array:
-        kl = kl_divergence(*distribution, mean_old, batch.log_std_old)
-        return weighted_mean(kl, weight)
 
-    def whole(function: Callable[[Any, jax.Array], Any]) -> Any:
-        """Means over the whole batch, of a function of (rows, mean_old)."""
-        return mean_over_blocks(
-            lambda block: function(*block), (rows, batch.mean_old), batch.weight
-        )
+def gradient_rule(config: AgentConfig) -> MultiplierRule:
+    """The weight is softplus(p), and p climbs along J_c - d by Adam."""
 
-    def apply(carry: Any, grads: Any) -> Any:
-        params, opt_state = carry
-        updates, opt_state = optimizer.update(grads, opt_state)
-        return optax.apply_updates(params, updates), opt_state
+    def init() -> tuple[Any, Any]:
+        # softplus(p) = multiplier_init
+        start = np.log(np.expm1(config.multiplier_init))
+        p = jnp.asarray(start, jnp.result_type(float))
+        return p, optax.adam(config.multiplier_lr).init(p)
 
-    def minibatch_step(carry: Any, rows: Any) -> tuple[Any, jax.Array]:
-        grads = mean_over_blocks(
-            lambda rows: jax.grad(loss_fn, has_aux=True)(carry[0], rows)[0],
-            rows,
-            rows[1][:, -1],
-        )
-        return apply(carry, grads), global_norm(grads)
+    def step(
+        p: jax.Array, memory: Any, j_c: jax.Array, limit: jax.Array
+    ) -> tuple[jax.Array, Any, jax.Array]:
+        p, memory = update_multiplier(config, p, memory, j_c, limit)
+        return p, memory, jax.nn.softplus(p)
 
-    def one_pass(carry: tuple[Any, jax.Array, jax.Array, jax.Array]) -> Any:
-        old, taken, _, first_norm = carry
-
-        def kl_and_grads(rows: Any, mean_old: jax.Array) -> Any:
-            grads, distribution = jax.grad(loss_fn, has_aux=True)(old[0], rows)
-            return kl_of(distribution, mean_old, rows[1][:, -1]), grads
-
-        def kl_alone(rows: Any, mean_old: jax.Array) -> jax.Array:
-            distribution = networks.distribution(old[0], rows[0])
-            return kl_of(distribution, mean_old, rows[1][:, -1])
-
-        if config.policy_minibatches == 1:
-            # The gradient's own forward pass is the whole batch at `old`.
-            kl, grads = whole(kl_and_grads)
-            new, norm = apply(old, grads), global_norm(grads)
-        else:
-            kl = whole(kl_alone)
-            split = split_rows(keys[taken], rows, config.policy_minibatches)
-            new, norms = jax.lax.scan(minibatch_step, old, split)
-            norm = norms[0]
-        stopped = ~(kl <= kl_stop)  # so written that a NaN stops as well
-        kept = jax.tree.map(lambda a, b: jnp.where(stopped, a, b), old, new)
-        first_norm = jnp.where(taken == 0, norm, first_norm)
-        return kept, taken + ~stopped, stopped, first_norm
-
-    def is_running(carry: tuple[Any, jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        _, taken, stopped, _ = carry
-        return ~stopped & (taken < config.policy_passes)
-
-    def at_end(rows: Any, mean_old: jax.Array) -> tuple[jax.Array, jax.Array]:
-        loss, distribution = loss_fn(params, rows)
-        return loss, kl_of(distribution, mean_old, rows[1][:, -1])
-
-    keys = jax.random.split(key, config.policy_passes)
-    zero = jnp.zeros((), batch.obs.dtype)
-    start = ((params, opt_state), jnp.zeros((), jnp.int32), jnp.zeros((), bool), zero)
-    # Ends when all slots of a `vmap` have stopped.
-    end = jax.lax.while_loop(is_running, one_pass, start)
-    (params, opt_state), taken, _, first_norm = end
-    loss, kl = whole(at_end)
-    return (
-        params,
-        opt_state,
-        {
-            "kl": kl,
-            "policy_loss": loss,
-            "entropy": entropy(params["log_std"]),
-            "policy_steps": taken * config.policy_minibatches,
-            "policy_grad_norm": first_norm,
-        },
-    )
+    return MultiplierRule(init, step)
 
 
 def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
@@ -229,6 +128,20 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
     Args:
       config: hyper-parameters.
       env: asked for its sizes only.
+
+    Returns:
+      The agent, with the metrics of `lagrangian_agent`.
+    """
+    return lagrangian_agent(config, env, gradient_rule(config))
+
+
+def lagrangian_agent(config: AgentConfig, env: EnvSizes, rule: MultiplierRule) -> Agent:
+    """PPO with a cost term weighed by a multiplier.
+
+    Args:
+      config: hyper-parameters.
+      env: asked for its sizes only.
+      rule: of the multiplier.
 
     Returns:
       The agent. Metrics of an update: `j_c`, `kl`, `policy_loss`, `value_loss`,
@@ -240,16 +153,14 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
 
     def init(key: Key) -> AgentState:
         policy, critic = networks.init(key)
-        dtype = jnp.result_type(float)
-        # softplus(p) = multiplier_init
-        p = jnp.asarray(np.log(np.expm1(config.multiplier_init)), dtype)
+        multiplier, memory = rule.init()
         return AgentState(
             policy=policy,
             critic=critic,
             policy_opt=optax.adam(config.policy_lr).init(policy),
             critic_opt=critic_optimizer(config).init(critic),
-            multiplier=p,
-            multiplier_opt=optax.adam(config.multiplier_lr).init(p),
+            multiplier=multiplier,
+            multiplier_opt=memory,
             normalizer=start_normalizer(config, env),
         )
 
@@ -265,21 +176,29 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
         batch, metrics = prepare_batch(
             config, networks, env.episode_length, state, trajectory, total_cost
         )
-        p, multiplier_opt = update_multiplier(
-            config,
-            state.multiplier,
-            state.multiplier_opt,
-            metrics["j_c"],
-            slot.cost.limit,
+        multiplier, memory, weight = rule.step(
+            state.multiplier, state.multiplier_opt, metrics["j_c"], slot.cost.limit
         )
-        multiplier = slot.constrained * jax.lax.stop_gradient(jax.nn.softplus(p))
-        policy, policy_opt, policy_metrics = update_policy(
+        weight = slot.constrained * jax.lax.stop_gradient(weight)
+
+        def loss(
+            mean: jax.Array, log_std: jax.Array, action: jax.Array, columns: jax.Array
+        ) -> jax.Array:
+            new = log_prob(action, mean, log_std)
+            return policy_loss(new, columns, weight, config.clip_eps)
+
+        columns = jnp.column_stack(
+            [batch.log_prob_old, batch.advantage, batch.cost_advantage, batch.weight]
+        )
+        policy, policy_opt, policy_metrics = take_passes(
             config,
             networks,
             state.policy,
             state.policy_opt,
             batch,
-            multiplier,
+            loss,
+            columns,
+            config.kl_stop_factor * config.target_kl,
             key_policy,
         )
         critic, critic_opt, critic_norm = update_critics(
@@ -290,16 +209,16 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
             critic=critic,
             policy_opt=policy_opt,
             critic_opt=critic_opt,
-            multiplier=p,
-            multiplier_opt=multiplier_opt,
+            multiplier=multiplier,
+            multiplier_opt=memory,
             normalizer=learn_obs(state, trajectory),
         )
         metrics = {
             **metrics,
             **policy_metrics,
             "critic_grad_norm": critic_norm,
-            "multiplier": multiplier,
-            "cost_weight": multiplier / (1.0 + multiplier),
+            "multiplier": weight,
+            "cost_weight": weight / (1.0 + weight),
         }
         return new_state, as_metrics(metrics)
 

@@ -28,7 +28,8 @@ from autocost_jax.config.checks import (
 )
 from autocost_jax.config.env import EnvConfig
 
-Algorithm = Literal["ppo_lagrangian", "cpo"]
+Algorithm = Literal["ppo_lagrangian", "cpo", "focops", "pid_lagrangian"]
+AlgorithmName = Literal["ppo", Algorithm]
 Selection = Literal["paper", "random"]
 Start = Literal["normal", "graded"]
 Judge = Literal["cost", "success"]

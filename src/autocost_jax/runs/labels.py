@@ -1,6 +1,11 @@
 """What algorithms and costs are called in front of people."""
 
-ALGORITHM_LABELS = {"ppo_lagrangian": "PPO-Lagrangian", "cpo": "CPO"}
+ALGORITHM_LABELS = {
+    "ppo_lagrangian": "PPO-Lagrangian",
+    "cpo": "CPO",
+    "focops": "FOCOPS",
+    "pid_lagrangian": "PID-Lagrangian",
+}
 COST_LABELS = {  # what agents are compared on, in the order of the summary
     "extrinsic": "extrinsic cost alone",
     "safety_margin_3x": "3x margin by hand",

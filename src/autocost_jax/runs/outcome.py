@@ -81,14 +81,15 @@ def score_agents(
         acting = jax.tree.map(lambda x, at=slots: x[at], actors[a])
         agent, states = policy_states(env, train, acting)
         if evaluator is None:
-            evaluator = make_evaluator(env, agent, num_episodes, watch=watch_first)
-        result, episodes = evaluator(states, key)
+            evaluator = make_evaluator(
+                env, agent, num_episodes, keep=first_recording, watch=watch_first
+            )
+        result, kept = evaluator(states, key)
         values[a, s] = jax.tree.map(np.asarray, result)
         if s == 0:
+            kept = jax.tree.map(np.asarray, kept)
             each = range(num_costs)
-            episodes = jax.tree.map(np.asarray, episodes)
-            one = [jax.tree.map(lambda x, c=c: x[c], episodes) for c in each]
-            recordings.append([first_recording(episode) for episode in one])
+            recordings.append([jax.tree.map(lambda x, c=c: x[c], kept) for c in each])
         tell(done, len(parts))
 
     def table(score: Callable[[EvalResult], np.ndarray]) -> np.ndarray:

@@ -1,7 +1,5 @@
 """One search in a run directory: watched, checkpointed, resumed, reported."""
 
-import itertools
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -18,6 +16,12 @@ from autocost_jax.files import flatten
 from autocost_jax.runs import cluster
 from autocost_jax.runs.directory import RunDir, open_run
 from autocost_jax.runs.finish import finish
+from autocost_jax.runs.limits import (
+    checkpoint_bytes,
+    evaluation_bytes,
+    require_memory,
+    training_bytes,
+)
 from autocost_jax.runs.loop import (
     Chunk,
     keep_chunks,
@@ -46,41 +50,7 @@ from autocost_jax.search.evolution import (
     require_survivors,
     slots_of,
 )
-from autocost_jax.search.stages import StageResult
-from autocost_jax.train import population_chunk
-
-
-def estimate_memory(config: SearchConfig, env: Env, num_devices: int) -> int:
-    """Bytes the largest arrays of the program need on each device, roughly.
-
-    The trajectory of all slots, twice (the rollout writes it time-first, the updates
-    read it slot-first), and four copies of parameters and optimiser moments.
-    """
-    slots = config.slots_per_algorithm * len(config.algorithms)
-    row = env.observation_size + 2 * env.action_size + 24
-    rows = config.train.num_worlds * env.episode_length
-    sizes = (env.observation_size, *config.train.agent.hidden_sizes, env.action_size)
-    weights = sum(a * b for a, b in itertools.pairwise(sizes))
-    width = max(config.train.agent.hidden_sizes, default=0)
-    batch = rows // config.train.agent.value_minibatches
-    activations = 4 * batch * width * len(config.train.agent.hidden_sizes)
-    per_slot = 2 * row * rows + 4 * 3 * 3 * weights
-    here = -(-slots // num_devices)
-    at_once = population_chunk(
-        config.train, -(-config.slots_per_algorithm // num_devices)
-    )
-    return 4 * (per_slot * here + activations * at_once)
-
-
-def estimate_disk(config: SearchConfig, env: Env) -> int:
-    """Bytes of four checkpoints (three are kept), which hold nearly all of a run."""
-    hidden = config.train.agent.hidden_sizes
-    networks = [(env.observation_size, *hidden, out) for out in (env.action_size, 1, 1)]
-    weights = sum(
-        (a + 1) * b for sizes in networks for a, b in itertools.pairwise(sizes)
-    )
-    slots = config.slots_per_algorithm * len(config.algorithms)
-    return 4 * 4 * 3 * weights * slots  # float32 parameters and two Adam moments
+from autocost_jax.search.stages import TRACKED, StageResult
 
 
 def describe(config: SearchConfig, env: Env, num_devices: int) -> list[str]:
@@ -91,7 +61,9 @@ def describe(config: SearchConfig, env: Env, num_devices: int) -> list[str]:
     if train.segments_per_episode > 1:
         worlds += f" in {train.segments_per_episode} cohorts"
     sizes = "-".join(str(size) for size in agent.hidden_sizes)
-    memory = estimate_memory(config, env, num_devices) / 1e9
+    groups = [config.slots_per_algorithm] * len(config.algorithms)
+    memory = training_bytes(train, env, groups, num_devices) / 1e9
+    disk = checkpoint_bytes(train, env, sum(groups)) / 1e6
     beside = ", beside the extrinsic cost alone and a margin of 3x"
     lines = [
         f"{train.env.name}: {config.num_stages} stages of {config.population_size} "
@@ -102,7 +74,7 @@ def describe(config: SearchConfig, env: Env, num_devices: int) -> list[str]:
         f"{agent.value_passes} x {agent.value_minibatches} steps an epoch",
         f"{config.env_steps:,} env steps in all; on {num_devices} device(s) of kind "
         f"{jax.devices()[0].device_kind}; about {memory:.2f} GB of memory on each and "
-        f"{estimate_disk(config, env) / 1e6:.0f} MB of disk; the time left is shown as "
+        f"{disk:.0f} MB of disk; the time left is shown as "
         "soon as the first epoch is done",
     ]
     if config.num_finalists:
@@ -120,24 +92,22 @@ def plan(config: SearchConfig, path: Path, num_devices: int) -> str:
     return "\n".join([*lines, f"would write to {path}"])
 
 
-def check_memory(config: SearchConfig, env: Env, devices: Sequence[Any]) -> None:
+def check_memory(
+    config: SearchConfig, env: Env, devices: Sequence[Any], num_episodes: int
+) -> None:
     """Refuse a run whose arrays cannot fit on its devices.
 
     Raises:
       ValueError: with the estimate and what the device has, if it tells.
     """
-    stats = jax.local_devices()[0].memory_stats() or {}
-    limit = stats.get("bytes_limit")
-    if devices[0].platform == "cpu":  # its devices share the machine's memory
-        machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        limit = machine // len(jax.local_devices())
-    need = estimate_memory(config, env, len(devices))
-    if limit is not None and need > limit:
-        raise ValueError(
-            f"the run needs about {need / 1e9:.1f} GB on each device, which has "
-            f"{limit / 1e9:.1f} GB: set population_chunk, lower population_size or "
-            "num_worlds, or use more devices"
-        )
+    groups = [config.slots_per_algorithm] * len(config.algorithms)
+    need = training_bytes(config.train, env, groups, len(devices))
+    epochs = max(map(config.epochs_of, range(config.total_stages)))
+    need += 4 * len(TRACKED) * epochs * sum(groups)
+    require_memory(need, "the search", devices)
+    costs = 1 + config.num_references  # an agent of each is scored at once
+    need = evaluation_bytes(env, costs, num_episodes)
+    require_memory(need, f"an evaluation over {num_episodes} episodes", devices)
 
 
 def run_search(
@@ -173,7 +143,7 @@ def run_search(
     require_episodes(num_episodes)
     devices = useful_devices(devices, config.slots_per_algorithm, "slots")
     searcher = make_searcher(config, devices)
-    check_memory(config, searcher.env, devices)
+    check_memory(config, searcher.env, devices, num_episodes)
     opened = open_run(path, config, resume=resume, overwrite=overwrite)
     with opened as run, Display(config.env_steps, 0, output(), planned) as display:
         warnings = run.warnings if run else []

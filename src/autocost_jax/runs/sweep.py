@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 
 from autocost_jax.agents.base import actor
-from autocost_jax.config import Algorithm, TrainConfig
+from autocost_jax.config import Algorithm, AlgorithmName, TrainConfig
 from autocost_jax.costs import parse_cost, training_cost
 from autocost_jax.envs.env import Env, make_env
 from autocost_jax.files import flatten
@@ -32,6 +32,11 @@ from autocost_jax.population import (
 from autocost_jax.records import Slot, root_key
 from autocost_jax.runs import cluster
 from autocost_jax.runs.directory import RunDir, open_run
+from autocost_jax.runs.limits import (
+    evaluation_bytes,
+    require_memory,
+    training_bytes,
+)
 from autocost_jax.runs.loop import (
     Chunk,
     keep_chunks,
@@ -50,9 +55,7 @@ from autocost_jax.runs.policies import (
 from autocost_jax.runs.progress import Display, format_seconds
 from autocost_jax.train import EpochState
 
-AlgorithmName = Literal["ppo", "ppo_lagrangian", "cpo"]
-# PPO is a PPO-Lagrangian slot that ignores cost.
-GROUPS: tuple[Algorithm, ...] = ("ppo_lagrangian", "cpo")
+GROUPS: tuple[Algorithm, ...] = get_args(Algorithm)
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class Method:
 
     Attributes:
       label: its name in files and tables.
-      algorithm: ppo, ppo_lagrangian or cpo.
+      algorithm: ppo, ppo_lagrangian, cpo, focops or pid_lagrangian.
       cost: the training cost, see `costs.training_cost`.
       limit: allowed training cost per episode.
       theta: the intrinsic network's parameters, if `cost` uses it.
@@ -80,11 +83,15 @@ class Method:
                 f"with a dot first, got {self.label!r}"
             )
         if self.algorithm not in ("ppo", *GROUPS):
-            raise ValueError(
-                f"algorithm must be ppo, ppo_lagrangian or cpo, got {self.algorithm!r}"
-            )
+            names = ", ".join(("ppo", *GROUPS))
+            raise ValueError(f"algorithm must be of {names}, got {self.algorithm!r}")
         theta = None if self.theta is None else np.asarray(self.theta)
         parse_cost(self.cost, theta, self.limit)
+
+    @property
+    def group(self) -> Algorithm:
+        """Whose slots it is among: PPO is a PPO-Lagrangian slot that ignores cost."""
+        return "ppo_lagrangian" if self.algorithm == "ppo" else self.algorithm
 
 
 @dataclass(frozen=True)
@@ -120,7 +127,7 @@ class SweepConfig:
             (method, seed)
             for method in self.methods
             for seed in self.seeds
-            if (method.algorithm == "cpo") == (name == "cpo")
+            if method.group == name
         ]
 
     @property
@@ -194,12 +201,17 @@ def run_sweep(
     Raises:
       RunDirError: the directory is not usable for this run.
       DiskFullError: the disk is full; the directory is intact.
+      ValueError: it does not fit the devices.
     """
     require_episodes(num_episodes)
     slots = sweep_slots(config)
-    largest = max(group.key.shape[0] for group in slots)
-    devices = useful_devices(devices, largest, "slots of an algorithm")
+    sizes = [group.key.shape[0] for group in slots]
+    devices = useful_devices(devices, max(sizes), "slots of an algorithm")
     env = make_env(config.train.env)
+    need = training_bytes(config.train, env, sizes, len(devices))
+    require_memory(need, "the training", devices)
+    need = evaluation_bytes(env, sum(sizes), num_episodes)
+    require_memory(need, f"an evaluation over {num_episodes} episodes", devices)
     agents = make_agents(config.algorithms, config.train, env)
     population = make_population(env, agents, config.train, devices=devices)
     opened = open_run(path, config, resume=resume, overwrite=overwrite)

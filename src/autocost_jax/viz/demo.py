@@ -66,12 +66,14 @@ def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
     acting, states = policy_states(
         env, train, jax.tree.map(lambda *leaves: np.stack(leaves), *loaded)
     )
-    evaluate = make_evaluator(env, acting, num_episodes, watch=watch_first)
-    result, episodes = evaluate(states, root_key(seed))
+    evaluate = make_evaluator(
+        env, acting, num_episodes, keep=first_recording, watch=watch_first
+    )
+    result, kept = evaluate(states, root_key(seed))
     theta = np.asarray(load_cost(FOUND))
     replays, lines = [], []
     for i, (name, label) in enumerate(LABELS.items()):
-        recording = first_recording(jax.tree.map(lambda x, i=i: x[i], episodes))
+        recording = jax.tree.map(lambda x, i=i: np.asarray(x[i]), kept)
         intrinsic = None
         if name == FOUND:
             intrinsic = network_cost(theta, recording.constraint_lidar)

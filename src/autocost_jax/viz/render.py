@@ -135,10 +135,10 @@ def record_episode(player: Player, seed: int) -> Recording:
     env = make_env(player.config)
     agent, state = player.make_agent(env)
     is_mean = player.actions == "mean"
-    run = make_evaluator(env, agent, 1, is_mean, watch=watch_first)
+    run = make_evaluator(env, agent, 1, is_mean, first_recording, watch=watch_first)
     key = jax.random.fold_in(root_key(seed), EVALUATION)
-    _, episodes = run(jax.tree.map(lambda leaf: leaf[None], state), key)
-    return first_recording(jax.tree.map(lambda leaf: leaf[0], episodes))
+    _, kept = run(jax.tree.map(lambda leaf: leaf[None], state), key)
+    return jax.tree.map(lambda leaf: np.asarray(leaf[0]), kept)
 
 
 def show(
