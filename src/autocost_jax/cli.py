@@ -210,7 +210,7 @@ def _evaluate(argv: list[str]) -> None:
     from autocost_jax.population import make_evaluator
     from autocost_jax.records import root_key
     from autocost_jax.runs.config_files import to_json
-    from autocost_jax.runs.limits import evaluation_bytes, require_memory
+    from autocost_jax.runs.limits import require_evaluation
     from autocost_jax.runs.policies import (
         EVALUATION,
         eval_summary,
@@ -222,10 +222,7 @@ def _evaluate(argv: list[str]) -> None:
     config = run_config(options.run)
     files = policy_files(options.run, options.policies)
     env = make_env(config.train.env)
-    need = evaluation_bytes(env, len(files), options.episodes)
-    require_memory(
-        need, f"an evaluation over {options.episodes} episodes", jax.devices()
-    )
+    require_evaluation(env, len(files), options.episodes, jax.devices())
     agent, states = load_policies(env, config.train, files)
     run = make_evaluator(env, agent, options.episodes, options.deterministic)
     key = jax.random.fold_in(root_key(options.seed), EVALUATION)

@@ -18,7 +18,7 @@ from autocost_jax.runs.directory import RunDir, open_run
 from autocost_jax.runs.finish import finish
 from autocost_jax.runs.limits import (
     checkpoint_bytes,
-    evaluation_bytes,
+    require_evaluation,
     require_memory,
     training_bytes,
 )
@@ -106,8 +106,7 @@ def check_memory(
     need += 4 * len(TRACKED) * epochs * sum(groups)
     require_memory(need, "the search", devices)
     costs = 1 + config.num_references  # an agent of each is scored at once
-    need = evaluation_bytes(env, costs, num_episodes)
-    require_memory(need, f"an evaluation over {num_episodes} episodes", devices)
+    require_evaluation(env, costs, num_episodes, devices)
 
 
 def run_search(

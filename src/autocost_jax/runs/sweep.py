@@ -33,7 +33,7 @@ from autocost_jax.records import Slot, root_key
 from autocost_jax.runs import cluster
 from autocost_jax.runs.directory import RunDir, open_run
 from autocost_jax.runs.limits import (
-    evaluation_bytes,
+    require_evaluation,
     require_memory,
     training_bytes,
 )
@@ -210,8 +210,7 @@ def run_sweep(
     env = make_env(config.train.env)
     need = training_bytes(config.train, env, sizes, len(devices))
     require_memory(need, "the training", devices)
-    need = evaluation_bytes(env, sum(sizes), num_episodes)
-    require_memory(need, f"an evaluation over {num_episodes} episodes", devices)
+    require_evaluation(env, sum(sizes), num_episodes, devices)
     agents = make_agents(config.algorithms, config.train, env)
     population = make_population(env, agents, config.train, devices=devices)
     opened = open_run(path, config, resume=resume, overwrite=overwrite)
