@@ -469,8 +469,18 @@ FINALS = dataclasses.replace(
 )
 
 
-def test_finalists_are_trained_afresh_in_the_same_program():
-    events = run(FINALS)
+@pytest.fixture(scope="module")
+def finals_searcher():
+    return make_searcher(FINALS)
+
+
+@pytest.fixture(scope="module")
+def finals(finals_searcher):
+    return run(FINALS, searcher=finals_searcher)
+
+
+def test_finalists_are_trained_afresh_in_the_same_program(finals_searcher, finals):
+    events = finals
     assert [(e.stage, e.epoch) for _, e in events] == [
         (stage, epoch) for stage in range(3) for epoch in range((3, 3, 5)[stage])
     ]
@@ -483,11 +493,12 @@ def test_finalists_are_trained_afresh_in_the_same_program():
     begun = next(state for state, e in events if e.stage == 1 and e.epoch == 2)
     assert (int(begun.stage), int(begun.epoch)) == (2, 0)
     # Killed in the finalists' stage it goes on to the same end.
-    assert_same_bits(run(FINALS, state=copy(events[7][0]))[-1][0], last)
+    resumed = run(FINALS, state=copy(events[7][0]), searcher=finals_searcher)
+    assert_same_bits(resumed[-1][0], last)
 
 
-def test_the_pure_search_trains_the_same_finalists():
-    events = run(FINALS)
+def test_the_pure_search_trains_the_same_finalists(finals):
+    events = finals
     pure = jax.jit(search(FINALS))(jax.random.key(FINALS.seed))
     assert pure.finalists.shape == (2, 41)
     np.testing.assert_allclose(pure.finalists, events[-1][0].candidates[:2], rtol=1e-6)

@@ -193,6 +193,16 @@ def test_bad_input_gets_one_line_and_status_2(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("command", ["render", "report"])
+def test_a_page_is_not_written_over_a_configuration(run_dir, capsys, command):
+    before = (run_dir / "config.yaml").read_bytes()
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--run", str(run_dir), "--out", str(run_dir / "config.yaml")])
+    assert stop.value.code == 2
+    assert "must be an .html file" in capsys.readouterr().err
+    assert (run_dir / "config.yaml").read_bytes() == before
+
+
 def test_an_unknown_policy_lists_those_of_the_run(run_dir, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["render", "--run", str(run_dir), "--policy", "best"])

@@ -18,6 +18,12 @@ def run_config(path: Path) -> Any:
     return read_config(path, SweepConfig if is_table else SearchConfig)[0]
 
 
+def _require_page(out: Path | None) -> None:
+    """Refuse to write a page over what is none, such as a run's configuration."""
+    if out is not None and out.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"out must be an .html file, got {str(out)!r}")
+
+
 def demo(argv: list[str]) -> None:
     """Shipped policies side by side."""
 
@@ -82,6 +88,7 @@ def render(argv: list[str]) -> None:
     options = parse(Options, argv, "autocost render")
     if (options.run is None) == (options.env is None):
         raise ValueError("give either --run DIR or --env NAME")
+    _require_page(options.out)
     use_compile_cache(options.compile_cache)
     from autocost_jax.viz.picture import film_size
     from autocost_jax.viz.render import best_policy, run_player, script_player, show
@@ -122,6 +129,7 @@ def report(argv: list[str]) -> None:
         out: Path | None = None
 
     options = parse(Options, argv, "autocost report")
+    _require_page(options.out)
     from autocost_jax.viz.run_data import write_run_report
 
     print(write_run_report(options.run, options.out))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from agent_toys import FULL_BATCH, SIZES, SMALL, Sizes, act, make_slot, make_trajectory
 
-from autocost_jax.agents import Agent, cpo, ppo_lagrangian
+from autocost_jax.agents import Agent, cpo, focops, ppo_lagrangian
 from autocost_jax.agents.networks import make_networks
 
 AGENTS = {"ppo_lagrangian": ppo_lagrangian, "cpo": cpo}
@@ -32,10 +32,13 @@ class Problem(NamedTuple):
     clean: Any  # what update gives for args
 
 
-@pytest.fixture(scope="module", params=[(a, m) for a in AGENTS for m in MODES])
+PROBLEMS = [(a, m) for a in AGENTS for m in MODES] + [("focops", "minibatch")]
+
+
+@pytest.fixture(scope="module", params=PROBLEMS)
 def problem(request):
     name, mode = request.param
-    agent = AGENTS[name](MODES[mode], SIZES)
+    agent = {**AGENTS, "focops": focops}[name](MODES[mode], SIZES)
     chex.clear_trace_counter()
     update = jax.jit(jax.vmap(chex.assert_max_traces(agent.update, n=1)))
     args = stack_problem(agent)

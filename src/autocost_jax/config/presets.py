@@ -20,7 +20,7 @@ _LAPTOP_AGENT = AgentConfig(
     multiplier_init=1.0,
     multiplier_lr=0.01,
     cg_iterations=5,
-    violation_factor=1.5,
+    violation_factor=1.35,
 )
 
 # Long stages rather than many (`experiments/fitness.py`), a start among costs of which
@@ -28,9 +28,9 @@ _LAPTOP_AGENT = AgentConfig(
 _GUIDED: dict[str, Any] = {
     "start": "graded",
     "init_std": 8.0,
-    "mutation_std": 0.3,
-    "mutation_low": 0.9,
-    "mutation_high": 1.1,
+    "mutation_std": 0.1,
+    "mutation_low": 0.97,
+    "mutation_high": 1.03,
     "references": True,
     "judge_by": "success",
     "pool_scores": True,
@@ -50,7 +50,7 @@ PRESETS: dict[str, SearchConfig] = {
         num_stages=2,
         fitness_epochs=12,
         num_finalists=4,
-        final_epochs=90,
+        final_epochs=120,
         **_GUIDED,
     ),
     "search": SearchConfig(
