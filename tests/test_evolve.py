@@ -354,6 +354,16 @@ def test_a_run_is_not_overwritten_by_accident(capsys, whole):
     assert (out / "metrics.jsonl").read_bytes() == before
 
 
+def test_of_two_that_exclude_each_other_none_wins(capsys, tmp_path):
+    RunDir.create(tmp_path, preset("smoke"), {}).close()
+    before = (tmp_path / "config.yaml").read_bytes()
+    both = ["--resume", "--overwrite", "--out", str(tmp_path)]
+    assert "give one" in bad(capsys, *both)
+    flags = ["--config", str(tmp_path), "--preset", "paper", "--dry-run"]
+    assert "give no --preset beside it" in bad(capsys, *flags)
+    assert (tmp_path / "config.yaml").read_bytes() == before
+
+
 def test_foreign_and_unreadable_directories_are_refused(capsys, tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     assert "not empty" in bad(capsys, *SMOKE, "--out", str(tmp_path))

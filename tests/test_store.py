@@ -261,12 +261,24 @@ def test_open_lets_population_chunk_differ(run: RunDir) -> None:
         RunDir.open(run.path, both)
 
 
-def test_open_warns_of_other_versions(tmp_path: Path) -> None:
-    facts = {**FACTS, "versions": {**FACTS["versions"], "jax": "0.0.1"}}
-    RunDir.create(tmp_path, SMOKE, facts).close()
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [
+        (
+            {"versions": {**FACTS["versions"], "jax": "0.0.1"}},
+            f"jax 0.0.1 -> {jax.__version__}",
+        ),
+        ({"num_devices": 64}, f"num_devices 64 -> {len(jax.devices())}"),
+    ],
+)
+def test_open_warns_of_other_versions_and_devices(
+    tmp_path: Path, facts: dict[str, Any], words: str
+) -> None:
+    """Another number of devices is another program, with other last bits."""
+    RunDir.create(tmp_path, SMOKE, {**FACTS, **facts}).close()
     with RunDir.open(tmp_path) as again:
-        assert len(again.warnings) == 1
-        assert f"jax 0.0.1 -> {jax.__version__}" in again.warnings[0]
+        (warning,) = again.warnings
+        assert words in warning
 
 
 HOLDER = """

@@ -87,6 +87,8 @@ def _base(options: Any) -> SearchConfig:
     source = options.config
     if source is not None and source.is_file():
         return replace_fields(base, read_settings(source))
+    if source is not None and options.preset is not None:
+        raise ValueError(f"{source} has all settings: give no --preset beside it")
     if source is None and options.resume and options.preset is None:
         source = options.out
     return base if source is None else read_config(source)[0]

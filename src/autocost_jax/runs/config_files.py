@@ -166,9 +166,10 @@ def run_facts(seed: int | None = None) -> dict[str, Any]:
 
 
 def changed_facts(old: dict[str, Any], new: dict[str, Any]) -> str:
-    """What differs in versions and device between two `run_facts`, as one line."""
+    """What differs in versions and devices between two `run_facts`, as one line."""
     before, after = (
-        {"device": facts.get("device"), **facts.get("versions", {})}
+        {name: facts.get(name) for name in ("device", "num_devices")}
+        | facts.get("versions", {})
         for facts in (old, new)
     )
     return ", ".join(

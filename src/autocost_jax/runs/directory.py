@@ -177,8 +177,8 @@ class RunDir:
         changed = changed_facts(facts, run_facts())
         if changed:
             run.warnings.append(
-                f"{path} was started with other versions, so results may"
-                f" differ: {changed}"
+                f"{path} was started with other versions or devices, so it will not "
+                f"end bit for bit as it would have: {changed}"
             )
         return run
 
@@ -359,6 +359,8 @@ def open_run(
     Raises:
       RunDirError: see `RunDir.create` and `RunDir.open`.
     """
+    if resume and overwrite:
+        raise ValueError("resume goes on with a run, overwrite starts over: give one")
     if not cluster.is_first():
         yield None
     elif resume:
