@@ -205,7 +205,7 @@ def test_killed_and_resumed_is_bit_for_bit_the_same(whole, environment, tmp_path
     process.wait()
     was_finished = (out / "cost.json").exists()
     done = subprocess.run(
-        command(out, "--resume", "--eval-episodes", "4"),
+        command(out, "--resume"),  # also how many episodes there were to be
         env=environment,
         capture_output=True,
         text=True,

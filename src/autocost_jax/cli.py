@@ -88,7 +88,8 @@ def _train(argv: list[str]) -> None:
           num_processes: of such a run; leave out with auto.
           process_id: of this one, from 0; leave out with auto.
           compile_cache: keep compiled programs in the user's cache directory.
-          episodes: fresh episodes a policy is scored in.
+          episodes: fresh episodes a policy is scored in; default: 100, or on --resume
+            as the run began.
         """
 
         preset: Literal["laptop", "search", "paper", "smoke"] | None = None
@@ -107,7 +108,7 @@ def _train(argv: list[str]) -> None:
         num_processes: int | None = None
         process_id: int | None = None
         compile_cache: bool = True
-        episodes: int = 100
+        episodes: int | None = None
 
     names = ("physics", "num_epochs", "num_worlds")
     flagged = with_flags(Options, TrainConfig, names)

@@ -121,7 +121,8 @@ def _options_type() -> Any:
           resume: continue the run in `out` from its newest checkpoint.
           overwrite: start over in a directory that already holds a run.
           dry_run: say what would be done, and stop.
-          eval_episodes: fresh episodes in which the best cost's agents are scored.
+          eval_episodes: fresh episodes in which the best cost's agents are scored;
+            default: 100, or on --resume as the run began.
           devices: devices to use; default: all; a CPU counts one a core.
           coordinator: of a run in several processes, HOST:PORT of the first one, or
             auto under SLURM and the like; start the command once for each of them.
@@ -138,7 +139,7 @@ def _options_type() -> Any:
         resume: bool = False
         overwrite: bool = False
         dry_run: bool = False
-        eval_episodes: int = 100
+        eval_episodes: int | None = None
         devices: int | None = None
         coordinator: str | None = None
         num_processes: int | None = None

@@ -66,6 +66,7 @@ __all__ = [
     "RunDirError",
     "check_free_space",
     "config_hash",
+    "episodes_of",
     "estimate_bytes",
     "from_dict",
     "list_stages",
@@ -78,6 +79,8 @@ __all__ = [
     "to_dict",
     "write_atomic",
 ]
+
+EPISODES = 100  # that score an agent unless told otherwise
 
 
 class RunDir:
@@ -350,9 +353,25 @@ class RunDir:
             return file.stat().st_size if file.exists() else 0
 
 
+def episodes_of(path: Path, resume: bool, asked: int | None) -> int:
+    """Fresh episodes that score an agent: as asked, else as the run began, else 100.
+
+    Raises:
+      ValueError: there are none.
+      RunDirError: there is no run to resume.
+    """
+    count = asked
+    if count is None and resume:
+        count = read_document(path).get("facts", {}).get("num_episodes")
+    count = EPISODES if count is None else count
+    if count < 1:
+        raise ValueError(f"number of episodes must be >= 1, got {count}")
+    return count
+
+
 @contextlib.contextmanager
 def open_run(
-    path: Path, config: Any, *, resume: bool, overwrite: bool
+    path: Path, config: Any, *, resume: bool, overwrite: bool, num_episodes: int
 ) -> Iterator[RunDir | None]:
     """The run directory of a new or resumed run; None where another process has it.
 
@@ -367,7 +386,9 @@ def open_run(
         with RunDir.open(path, config) as run:
             yield run
     else:
-        with RunDir.create(path, config, overwrite=overwrite) as run:
+        facts = run_facts(getattr(config, "seed", None))
+        facts["num_episodes"] = num_episodes
+        with RunDir.create(path, config, facts, overwrite) as run:
             yield run
 
 

@@ -19,12 +19,6 @@ from autocost_jax.records import EvalResult, Key, root_key
 EVALUATION = 2**31 - 1  # purpose of the final evaluation's key, beyond any stage
 
 
-def require_episodes(num_episodes: int) -> None:
-    """Refuse an evaluation without an episode before anything is trained."""
-    if num_episodes < 1:
-        raise ValueError(f"number of episodes must be >= 1, got {num_episodes}")
-
-
 def policy_name(stage: int, algorithm: str) -> str:
     """File stem of the policy of a stage's best candidate."""
     return f"stage_{stage:02d}_{algorithm}"

@@ -14,7 +14,7 @@ from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import Env, make_env
 from autocost_jax.files import flatten
 from autocost_jax.runs import cluster
-from autocost_jax.runs.directory import RunDir, open_run
+from autocost_jax.runs.directory import RunDir, episodes_of, open_run
 from autocost_jax.runs.finish import finish
 from autocost_jax.runs.limits import (
     checkpoint_bytes,
@@ -30,10 +30,7 @@ from autocost_jax.runs.loop import (
     start,
     useful_devices,
 )
-from autocost_jax.runs.policies import (
-    policy_name,
-    require_episodes,
-)
+from autocost_jax.runs.policies import policy_name
 from autocost_jax.runs.progress import (
     Display,
     format_seconds,
@@ -116,7 +113,7 @@ def run_search(
     resume: bool = False,
     overwrite: bool = False,
     devices: Sequence[Any] | None = None,
-    num_episodes: int = 100,
+    num_episodes: int | None = None,
     planned: float | None = None,
     write_report: Callable[[Path], Path] | None = None,
 ) -> None:
@@ -129,7 +126,8 @@ def run_search(
       resume: continue from the newest whole checkpoint.
       overwrite: start over in a directory that already holds a run.
       devices: default: the first one.
-      num_episodes: episodes of the final evaluation, of each agent.
+      num_episodes: of the final evaluation, of each agent; default: the run's own on
+        resume, else 100.
       planned: seconds that it is meant to take; a slower machine is told so.
       write_report: run directory -> its report; default: none is written.
 
@@ -139,11 +137,12 @@ def run_search(
       ValueError: the configuration does not fit the devices.
       RuntimeError: every candidate of a stage failed.
     """
-    require_episodes(num_episodes)
+    num_episodes = episodes_of(path, resume, num_episodes)
     devices = useful_devices(devices, config.slots_per_algorithm, "slots")
     searcher = make_searcher(config, devices)
     check_memory(config, searcher.env, devices, num_episodes)
-    opened = open_run(path, config, resume=resume, overwrite=overwrite)
+    how = {"resume": resume, "overwrite": overwrite, "num_episodes": num_episodes}
+    opened = open_run(path, config, **how)
     with opened as run, Display(config.env_steps, 0, output(), planned) as display:
         warnings = run.warnings if run else []
         for line in [*warnings, *describe(config, searcher.env, len(devices))]:

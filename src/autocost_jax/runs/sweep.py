@@ -31,7 +31,7 @@ from autocost_jax.population import (
 )
 from autocost_jax.records import Slot, root_key
 from autocost_jax.runs import cluster
-from autocost_jax.runs.directory import RunDir, open_run
+from autocost_jax.runs.directory import RunDir, episodes_of, open_run
 from autocost_jax.runs.limits import (
     require_evaluation,
     require_memory,
@@ -49,7 +49,6 @@ from autocost_jax.runs.policies import (
     EVALUATION,
     eval_summary,
     load_policies,
-    require_episodes,
     score_line,
 )
 from autocost_jax.runs.progress import Display, format_seconds
@@ -181,7 +180,7 @@ def run_sweep(
     resume: bool = False,
     overwrite: bool = False,
     devices: Sequence[Any] | None = None,
-    num_episodes: int = 100,
+    num_episodes: int | None = None,
 ) -> list[dict[str, Any]]:
     """Train and evaluate a table in a run directory, or resume it.
 
@@ -192,7 +191,8 @@ def run_sweep(
       resume: continue from the newest whole checkpoint.
       overwrite: start over in a directory that already holds a run.
       devices: default: the first one.
-      num_episodes: fresh episodes a slot in the final evaluation.
+      num_episodes: fresh episodes a slot in the final evaluation; default: the run's
+        own on resume, else 100.
 
     Returns:
       For each slot its method, seed and scores, as in evaluation.json; of several
@@ -203,7 +203,7 @@ def run_sweep(
       DiskFullError: the disk is full; the directory is intact.
       ValueError: it does not fit the devices.
     """
-    require_episodes(num_episodes)
+    num_episodes = episodes_of(path, resume, num_episodes)
     slots = sweep_slots(config)
     sizes = [group.key.shape[0] for group in slots]
     devices = useful_devices(devices, max(sizes), "slots of an algorithm")
@@ -213,7 +213,8 @@ def run_sweep(
     require_evaluation(env, sum(sizes), num_episodes, devices)
     agents = make_agents(config.algorithms, config.train, env)
     population = make_population(env, agents, config.train, devices=devices)
-    opened = open_run(path, config, resume=resume, overwrite=overwrite)
+    how = {"resume": resume, "overwrite": overwrite, "num_episodes": num_episodes}
+    opened = open_run(path, config, **how)
     with opened as run, Display(config.env_steps, 0, output()) as display:
         for line in run.warnings if run else ():
             display.say(line)
