@@ -211,6 +211,7 @@ def test_create_in_what_a_kill_left(tmp_path: Path) -> None:
         (b"\xff\xfe\x00", "not readable"),
         (b"format: other", "not written by this package"),
         (b"format: autocost_jax run 1\nconfig: {seed: 1}", "missing field train"),
+        (b"format: autocost_jax run 1\nconfig: {}\nfacts: []", "not a mapping"),
         ("directory", "not readable"),
     ],
 )

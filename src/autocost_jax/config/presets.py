@@ -20,7 +20,7 @@ _LAPTOP_AGENT = AgentConfig(
     multiplier_init=1.0,
     multiplier_lr=0.01,
     cg_iterations=5,
-    violation_factor=1.35,
+    violation_factor=1.6,
 )
 
 # Long stages rather than many (`experiments/fitness.py`), a start among costs of which

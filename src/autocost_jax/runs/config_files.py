@@ -187,7 +187,7 @@ def read_config(path: str | Path, cls: type[C] = SearchConfig) -> tuple[C, dict]
     """
     document = read_document(Path(path))
     try:
-        return from_dict(cls, document.get("config")), document.get("facts") or {}
+        return from_dict(cls, document.get("config")), document["facts"]
     except ValueError as error:
         raise RunDirError(f"{Path(path) / CONFIG}: {error}") from None
 
@@ -206,6 +206,8 @@ def read_document(path: Path) -> dict[str, Any]:
         raise RunDirError(f"{file} is not readable: {reason}") from None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise RunDirError(f"{file} was not written by this package as {FORMAT!r}")
+    if not isinstance(document.setdefault("facts", {}), dict):
+        raise RunDirError(f"the facts of {file} are not a mapping")
     return document
 
 

@@ -362,9 +362,9 @@ def episodes_of(path: Path, resume: bool, asked: int | None) -> int:
     """
     count = asked
     if count is None and resume:
-        count = read_document(path).get("facts", {}).get("num_episodes")
+        count = read_document(path)["facts"].get("num_episodes")
     count = EPISODES if count is None else count
-    if count < 1:
+    if not isinstance(count, int) or count < 1:
         raise ValueError(f"number of episodes must be >= 1, got {count}")
     return count
 
