@@ -264,7 +264,7 @@ def exists(design: str, scale: Scale) -> bool:
 
 def content(method: Method) -> Method:
     """A method whatever it is called."""
-    return dataclasses.replace(method, label="")
+    return dataclasses.replace(method, label="-")
 
 
 class Trained(NamedTuple):

@@ -230,7 +230,7 @@ PROMISED = {
         "steps": 1000,
         "nets": (32, 32),
         "policy": (4, 8),
-        "value": (4, 8),
+        "value": (3, 8),
     },
     "search": {
         "candidates": 50,

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from autocost_jax import population as population_lib
+from autocost_jax.config import Algorithm
 from autocost_jax.population import (
     candidate_slots,
     make_agents,
@@ -432,5 +434,5 @@ def test_an_environment_of_another_length_is_refused_when_the_program_is_built()
         make_population(env, (linear_agent(env),), TRAIN)
 
 
-def test_only_this_module_names_the_algorithms():
-    assert set(population_lib.AGENTS) == set(ALGORITHMS)
+def test_every_algorithm_of_the_configuration_has_its_agent():
+    assert set(population_lib.AGENTS) == set(get_args(Algorithm))
