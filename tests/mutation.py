@@ -41,7 +41,7 @@ TESTS = {
     "es.py": ["test_es.py"],
     "agents/advantages.py": ["agents/test_advantages.py"],
     "agents/ppo_lagrangian.py": ["agents/test_ppo_lagrangian.py"],
-    "agents/passes.py": ["agents/test_ppo_lagrangian.py"],
+    "agents/first_order.py": ["agents/test_ppo_lagrangian.py"],
     "agents/focops.py": ["agents/test_focops.py"],
     "agents/pid_lagrangian.py": ["agents/test_pid_lagrangian.py"],
     "agents/cpo.py": ["agents/test_cpo.py"],

@@ -17,9 +17,8 @@ MAX_FUNCTION, MAX_MODULE = 60, 350  # lines that are not docstring
 # Closures over one agent's configuration, read from top to bottom.
 LONG_FUNCTIONS = {
     "agents/fisher.py:mlp_fisher_product",
-    "agents/passes.py:take_passes",
-    "agents/ppo_lagrangian.py:lagrangian_agent",
-    "agents/focops.py:focops",
+    "agents/first_order.py:take_passes",
+    "agents/first_order.py:first_order_agent",
 }
 # All that modules may import at their top, beside the standard library.
 RUNTIME = {"jax", "flax", "optax", "chex", "numpy", "mujoco", "orbax", "autocost_jax"}

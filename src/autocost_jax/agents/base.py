@@ -59,8 +59,8 @@ class AgentState(struct.PyTreeNode):
       critic: parameters of the reward and the cost critic, stacked on an axis of 2.
       policy_opt: Adam's state; () for CPO.
       critic_opt: Adam's state.
-      multiplier: [] p, the multiplier is softplus(p); () for CPO.
-      multiplier_opt: Adam's state; () for CPO.
+      multiplier: [] of PPO-Lagrangian p, the multiplier is softplus(p); () for CPO.
+      multiplier_opt: what its rule remembers, such as Adam's state; () for CPO.
       normalizer: of the observations; () without `AgentConfig.normalize_obs`.
     """
 
@@ -93,6 +93,39 @@ def actor(state: AgentState) -> Actor:
 def start_normalizer(config: AgentConfig, env: EnvSizes) -> Any:
     """The normalizer that an agent begins with; () if it has none."""
     return init_normalizer(env.observation_size) if config.normalize_obs else ()
+
+
+def make_init(
+    config: AgentConfig,
+    networks: Networks,
+    env: EnvSizes,
+    optimizer: optax.GradientTransformation | None = None,
+    multiplier: Callable[[], tuple[Any, Any]] = lambda: ((), ()),
+) -> Callable[[Key], AgentState]:
+    """The function of `Agent.init`.
+
+    Args:
+      config: hyper-parameters.
+      networks: of the agent.
+      env: asked for its sizes only.
+      optimizer: of the policy; None: it has no state.
+      multiplier: () -> the multiplier and its memory.
+    """
+
+    def init(key: Key) -> AgentState:
+        policy, critic = networks.init(key)
+        start, memory = multiplier()
+        return AgentState(
+            policy=policy,
+            critic=critic,
+            policy_opt=() if optimizer is None else optimizer.init(policy),
+            critic_opt=critic_optimizer(config).init(critic),
+            multiplier=start,
+            multiplier_opt=memory,
+            normalizer=start_normalizer(config, env),
+        )
+
+    return init
 
 
 def seen_by(state: AgentState, obs: jax.Array) -> jax.Array:

@@ -19,11 +19,10 @@ from autocost_jax.agents.base import (
     Batch,
     EnvSizes,
     as_metrics,
-    critic_optimizer,
     learn_obs,
+    make_init,
     make_policy,
     prepare_batch,
-    start_normalizer,
     update_critics,
 )
 from autocost_jax.agents.fisher import mlp_fisher_product
@@ -221,18 +220,6 @@ def cpo(config: AgentConfig, env: EnvSizes) -> Agent:
     """
     networks = make_networks(config, env.observation_size, env.action_size)
 
-    def init(key: Key) -> AgentState:
-        policy, critic = networks.init(key)
-        return AgentState(
-            policy=policy,
-            critic=critic,
-            policy_opt=(),
-            critic_opt=critic_optimizer(config).init(critic),
-            multiplier=(),
-            multiplier_opt=(),
-            normalizer=start_normalizer(config, env),
-        )
-
     @full_precision
     def update(
         state: AgentState,
@@ -277,4 +264,5 @@ def cpo(config: AgentConfig, env: EnvSizes) -> Agent:
         }
         return new_state, as_metrics(metrics)
 
+    init = make_init(config, networks, env)
     return Agent(init, make_policy(networks), update)

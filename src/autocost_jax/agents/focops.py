@@ -7,26 +7,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from autocost_jax.agents.advantages import normalise, weighted_mean
-from autocost_jax.agents.base import (
-    Agent,
-    AgentState,
-    EnvSizes,
-    as_metrics,
-    critic_optimizer,
-    learn_obs,
-    make_policy,
-    prepare_batch,
-    start_normalizer,
-    update_critics,
-)
-from autocost_jax.agents.networks import kl_divergence, log_prob, make_networks
-from autocost_jax.agents.passes import take_passes
+from autocost_jax.agents.base import Agent, Batch, EnvSizes
+from autocost_jax.agents.first_order import Loss, MultiplierRule, first_order_agent
+from autocost_jax.agents.networks import kl_divergence, log_prob
 from autocost_jax.config import AgentConfig
-from autocost_jax.precision import full_precision
-from autocost_jax.records import Key, Metrics, Slot, Trajectory
 
 
 class FocopsSettings(NamedTuple):
@@ -77,43 +63,19 @@ def focops(
       settings: of FOCOPS alone.
 
     Returns:
-      The agent, with the metrics of `lagrangian_agent`; `multiplier` is nu.
+      The agent, with the metrics of `first_order_agent`; `multiplier` is nu.
     """
-    networks = make_networks(config, env.observation_size, env.action_size)
 
-    def init(key: Key) -> AgentState:
-        policy, critic = networks.init(key)
-        return AgentState(
-            policy=policy,
-            critic=critic,
-            policy_opt=optax.adam(config.policy_lr).init(policy),
-            critic_opt=critic_optimizer(config).init(critic),
-            multiplier=jnp.zeros((), jnp.result_type(float)),
-            multiplier_opt=(),
-            normalizer=start_normalizer(config, env),
-        )
+    def init() -> tuple[jax.Array, tuple[()]]:
+        return jnp.zeros((), jnp.result_type(float)), ()
 
-    @full_precision
-    def update(
-        state: AgentState,
-        trajectory: Trajectory,
-        total_cost: jax.Array,
-        slot: Slot,
-        key: Key,
-    ) -> tuple[AgentState, Metrics]:
-        key_policy, key_critic = jax.random.split(key)
-        batch, metrics = prepare_batch(
-            config, networks, env.episode_length, state, trajectory, total_cost
-        )
-        climb = settings.nu_lr * (metrics["j_c"] - slot.cost.limit)
-        nu = jnp.clip(state.multiplier + climb, 0.0, settings.nu_max)
-        weight = slot.constrained * nu
-        cost_advantage = normalise(batch.cost_advantage, batch.weight)
-        advantage = batch.advantage - weight * cost_advantage
-        columns = jnp.column_stack(
-            [batch.mean_old, batch.log_prob_old, advantage, batch.weight]
-        )
+    def step(
+        nu: jax.Array, memory: tuple[()], j_c: jax.Array, limit: jax.Array
+    ) -> tuple[jax.Array, tuple[()], jax.Array]:
+        nu = jnp.clip(nu + settings.nu_lr * (j_c - limit), 0.0, settings.nu_max)
+        return nu, memory, nu
 
+    def make_loss(batch: Batch, nu: jax.Array) -> tuple[Loss, jax.Array]:
         def loss(
             mean: jax.Array, log_std: jax.Array, action: jax.Array, columns: jax.Array
         ) -> jax.Array:
@@ -123,26 +85,10 @@ def focops(
             near, temperature = config.target_kl, settings.temperature
             return focops_loss(kl, log_ratio, advantage, weight, near, temperature)
 
-        policy, policy_opt, policy_metrics = take_passes(
-            config, networks, state.policy, state.policy_opt, batch, loss, columns,
-            config.target_kl, key_policy,
-        )  # fmt: skip
-        critic, critic_opt, critic_norm = update_critics(
-            config, networks, state.critic, state.critic_opt, batch, key_critic
-        )
-        new_state = state.replace(
-            policy=policy,
-            critic=critic,
-            policy_opt=policy_opt,
-            critic_opt=critic_opt,
-            multiplier=nu,
-            normalizer=learn_obs(state, trajectory),
-        )
-        metrics |= policy_metrics | {
-            "critic_grad_norm": critic_norm,
-            "multiplier": weight,
-            "cost_weight": weight / (1.0 + weight),
-        }
-        return new_state, as_metrics(metrics)
+        cost_advantage = normalise(batch.cost_advantage, batch.weight)
+        advantage = batch.advantage - nu * cost_advantage
+        columns = [batch.mean_old, batch.log_prob_old, advantage, batch.weight]
+        return loss, jnp.column_stack(columns)
 
-    return Agent(init, make_policy(networks), update)
+    rule = MultiplierRule(init, step)
+    return first_order_agent(config, env, rule, make_loss, config.target_kl)

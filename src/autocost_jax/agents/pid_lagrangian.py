@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from autocost_jax.agents.base import Agent, EnvSizes
-from autocost_jax.agents.ppo_lagrangian import MultiplierRule, lagrangian_agent
+from autocost_jax.agents.first_order import MultiplierRule
+from autocost_jax.agents.ppo_lagrangian import ppo_agent
 from autocost_jax.config import AgentConfig
 
 
@@ -92,7 +93,7 @@ def pid_lagrangian(
       gains: of the controller.
 
     Returns:
-      The agent, with the metrics of `lagrangian_agent`.
+      The agent, with the metrics of `first_order_agent`.
     """
 
     def init() -> tuple[jax.Array, PidMemory]:
@@ -106,4 +107,4 @@ def pid_lagrangian(
         memory, multiplier = pid_step(gains, memory, j_c, limit)
         return multiplier, memory, multiplier
 
-    return lagrangian_agent(config, env, MultiplierRule(init, step))
+    return ppo_agent(config, env, MultiplierRule(init, step))

@@ -4,8 +4,7 @@ Source: openai/safety-starter-agents, with the multiplier held constant inside t
 policy loss and the KL stop tested before a pass instead of after it.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,23 +12,10 @@ import numpy as np
 import optax
 
 from autocost_jax.agents.advantages import weighted_mean
-from autocost_jax.agents.base import (
-    Agent,
-    AgentState,
-    EnvSizes,
-    as_metrics,
-    critic_optimizer,
-    learn_obs,
-    make_policy,
-    prepare_batch,
-    start_normalizer,
-    update_critics,
-)
-from autocost_jax.agents.networks import log_prob, make_networks
-from autocost_jax.agents.passes import take_passes
+from autocost_jax.agents.base import Agent, Batch, EnvSizes
+from autocost_jax.agents.first_order import Loss, MultiplierRule, first_order_agent
+from autocost_jax.agents.networks import log_prob
 from autocost_jax.config import AgentConfig
-from autocost_jax.precision import full_precision
-from autocost_jax.records import Key, Metrics, Slot, Trajectory
 
 
 def update_multiplier(
@@ -91,19 +77,6 @@ def policy_loss(
     return -(gain - multiplier * price) / (1.0 + multiplier)
 
 
-class MultiplierRule(NamedTuple):
-    """How the weight of the cost follows the cost.
-
-    Attributes:
-      init: () -> (multiplier, memory), pytrees of arrays.
-      step: (multiplier, memory, j_c, limit) -> (multiplier, memory, weight []); once an
-        epoch, before the policy learns.
-    """
-
-    init: Callable[[], tuple[Any, Any]]
-    step: Callable[..., tuple[Any, Any, jax.Array]]
-
-
 def gradient_rule(config: AgentConfig) -> MultiplierRule:
     """The weight is softplus(p), and p climbs along J_c - d by Adam."""
 
@@ -122,6 +95,23 @@ def gradient_rule(config: AgentConfig) -> MultiplierRule:
     return MultiplierRule(init, step)
 
 
+def ppo_agent(config: AgentConfig, env: EnvSizes, rule: MultiplierRule) -> Agent:
+    """PPO with a cost term weighed by the multiplier of a rule."""
+
+    def make_loss(batch: Batch, multiplier: jax.Array) -> tuple[Loss, jax.Array]:
+        def loss(
+            mean: jax.Array, log_std: jax.Array, action: jax.Array, columns: jax.Array
+        ) -> jax.Array:
+            new = log_prob(action, mean, log_std)
+            return policy_loss(new, columns, multiplier, config.clip_eps)
+
+        columns = [batch.log_prob_old, batch.advantage, batch.cost_advantage]
+        return loss, jnp.column_stack([*columns, batch.weight])
+
+    kl_stop = config.kl_stop_factor * config.target_kl
+    return first_order_agent(config, env, rule, make_loss, kl_stop)
+
+
 def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
     """PPO with a cost term whose weight rises while J_c exceeds the limit.
 
@@ -130,96 +120,6 @@ def ppo_lagrangian(config: AgentConfig, env: EnvSizes) -> Agent:
       env: asked for its sizes only.
 
     Returns:
-      The agent, with the metrics of `lagrangian_agent`.
+      The agent, with the metrics of `first_order_agent`.
     """
-    return lagrangian_agent(config, env, gradient_rule(config))
-
-
-def lagrangian_agent(config: AgentConfig, env: EnvSizes, rule: MultiplierRule) -> Agent:
-    """PPO with a cost term weighed by a multiplier.
-
-    Args:
-      config: hyper-parameters.
-      env: asked for its sizes only.
-      rule: of the multiplier.
-
-    Returns:
-      The agent. Metrics of an update: `j_c`, `kl`, `policy_loss`, `value_loss`,
-      `cost_value_loss`, `entropy`, `policy_steps`, `policy_grad_norm`,
-      `critic_grad_norm`, `valid_fraction`, `multiplier` (constrained * lambda after
-      its step) and `cost_weight` = multiplier / (1 + multiplier).
-    """
-    networks = make_networks(config, env.observation_size, env.action_size)
-
-    def init(key: Key) -> AgentState:
-        policy, critic = networks.init(key)
-        multiplier, memory = rule.init()
-        return AgentState(
-            policy=policy,
-            critic=critic,
-            policy_opt=optax.adam(config.policy_lr).init(policy),
-            critic_opt=critic_optimizer(config).init(critic),
-            multiplier=multiplier,
-            multiplier_opt=memory,
-            normalizer=start_normalizer(config, env),
-        )
-
-    @full_precision
-    def update(
-        state: AgentState,
-        trajectory: Trajectory,
-        total_cost: jax.Array,
-        slot: Slot,
-        key: Key,
-    ) -> tuple[AgentState, Metrics]:
-        key_policy, key_critic = jax.random.split(key)
-        batch, metrics = prepare_batch(
-            config, networks, env.episode_length, state, trajectory, total_cost
-        )
-        multiplier, memory, weight = rule.step(
-            state.multiplier, state.multiplier_opt, metrics["j_c"], slot.cost.limit
-        )
-        weight = slot.constrained * jax.lax.stop_gradient(weight)
-
-        def loss(
-            mean: jax.Array, log_std: jax.Array, action: jax.Array, columns: jax.Array
-        ) -> jax.Array:
-            new = log_prob(action, mean, log_std)
-            return policy_loss(new, columns, weight, config.clip_eps)
-
-        columns = jnp.column_stack(
-            [batch.log_prob_old, batch.advantage, batch.cost_advantage, batch.weight]
-        )
-        policy, policy_opt, policy_metrics = take_passes(
-            config,
-            networks,
-            state.policy,
-            state.policy_opt,
-            batch,
-            loss,
-            columns,
-            config.kl_stop_factor * config.target_kl,
-            key_policy,
-        )
-        critic, critic_opt, critic_norm = update_critics(
-            config, networks, state.critic, state.critic_opt, batch, key_critic
-        )
-        new_state = AgentState(
-            policy=policy,
-            critic=critic,
-            policy_opt=policy_opt,
-            critic_opt=critic_opt,
-            multiplier=multiplier,
-            multiplier_opt=memory,
-            normalizer=learn_obs(state, trajectory),
-        )
-        metrics = {
-            **metrics,
-            **policy_metrics,
-            "critic_grad_norm": critic_norm,
-            "multiplier": weight,
-            "cost_weight": weight / (1.0 + weight),
-        }
-        return new_state, as_metrics(metrics)
-
-    return Agent(init, make_policy(networks), update)
+    return ppo_agent(config, env, gradient_rule(config))

@@ -1,21 +1,133 @@
-"""Passes of first-order steps over an epoch's rows, until the KL is too large."""
+"""Agents that learn by passes of Adam steps and weigh the cost by a multiplier."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from autocost_jax.agents.advantages import weighted_mean
-from autocost_jax.agents.base import Batch, global_norm, split_rows
+from autocost_jax.agents.base import (
+    Agent,
+    AgentState,
+    Batch,
+    EnvSizes,
+    as_metrics,
+    global_norm,
+    learn_obs,
+    make_init,
+    make_policy,
+    prepare_batch,
+    split_rows,
+    update_critics,
+)
 from autocost_jax.agents.blocks import mean_over_blocks
-from autocost_jax.agents.networks import Networks, Params, entropy, kl_divergence
+from autocost_jax.agents.networks import (
+    Networks,
+    Params,
+    entropy,
+    kl_divergence,
+    make_networks,
+)
 from autocost_jax.config import AgentConfig
-from autocost_jax.records import Key, Metrics
+from autocost_jax.precision import full_precision
+from autocost_jax.records import Key, Metrics, Slot, Trajectory
 
 # (mean [r, U], log_std [U], action [r, U], columns [r, C]) -> weighted mean over rows
 Loss = Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]
+# (batch, weight of the cost []) -> the loss, and its columns [R, C]
+MakeLoss = Callable[[Batch, jax.Array], tuple[Loss, jax.Array]]
+
+
+class MultiplierRule(NamedTuple):
+    """How the weight of the cost follows the cost.
+
+    Attributes:
+      init: () -> (multiplier, memory), pytrees of arrays.
+      step: (multiplier, memory, j_c, limit) -> (multiplier, memory, weight []); once an
+        epoch, before the policy learns.
+    """
+
+    init: Callable[[], tuple[Any, Any]]
+    step: Callable[..., tuple[Any, Any, jax.Array]]
+
+
+def first_order_agent(
+    config: AgentConfig,
+    env: EnvSizes,
+    rule: MultiplierRule,
+    make_loss: MakeLoss,
+    kl_stop: float,
+) -> Agent:
+    """An agent whose policy descends a loss of the reward and the weighed cost.
+
+    Args:
+      config: hyper-parameters.
+      env: asked for its sizes only.
+      rule: of the cost's weight.
+      make_loss: what an epoch's policy descends; the weight is 0 in a slot whose
+        `constrained` is.
+      kl_stop: the KL that ends an update's passes.
+
+    Returns:
+      The agent. Metrics of an update: `j_c`, `kl`, `policy_loss`, `value_loss`,
+      `cost_value_loss`, `entropy`, `policy_steps`, `policy_grad_norm`,
+      `critic_grad_norm`, `valid_fraction`, `multiplier` (constrained * the weight after
+      its step) and `cost_weight` = multiplier / (1 + multiplier).
+    """
+    networks = make_networks(config, env.observation_size, env.action_size)
+
+    @full_precision
+    def update(
+        state: AgentState,
+        trajectory: Trajectory,
+        total_cost: jax.Array,
+        slot: Slot,
+        key: Key,
+    ) -> tuple[AgentState, Metrics]:
+        key_policy, key_critic = jax.random.split(key)
+        batch, metrics = prepare_batch(
+            config, networks, env.episode_length, state, trajectory, total_cost
+        )
+        multiplier, memory, weight = rule.step(
+            state.multiplier, state.multiplier_opt, metrics["j_c"], slot.cost.limit
+        )
+        weight = slot.constrained * jax.lax.stop_gradient(weight)
+        policy, policy_opt, policy_metrics = take_passes(
+            config,
+            networks,
+            state.policy,
+            state.policy_opt,
+            batch,
+            *make_loss(batch, weight),
+            kl_stop,
+            key_policy,
+        )
+        critic, critic_opt, critic_norm = update_critics(
+            config, networks, state.critic, state.critic_opt, batch, key_critic
+        )
+        new_state = AgentState(
+            policy=policy,
+            critic=critic,
+            policy_opt=policy_opt,
+            critic_opt=critic_opt,
+            multiplier=multiplier,
+            multiplier_opt=memory,
+            normalizer=learn_obs(state, trajectory),
+        )
+        metrics = {
+            **metrics,
+            **policy_metrics,
+            "critic_grad_norm": critic_norm,
+            "multiplier": weight,
+            "cost_weight": weight / (1.0 + weight),
+        }
+        return new_state, as_metrics(metrics)
+
+    optimizer = optax.adam(config.policy_lr)
+    init = make_init(config, networks, env, optimizer, rule.init)
+    return Agent(init, make_policy(networks), update)
 
 
 def take_passes(
