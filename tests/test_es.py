@@ -194,6 +194,26 @@ def test_a_graded_start_hears_all_directions(key, places):
     assert (deaf.min(1) / deaf.mean(1)).mean() < 0.25
 
 
+def test_mutations_of_the_presets_leave_children_near_their_parents(key, places):
+    """Where they are loud; three times as large ones do not."""
+    theta, costs = graded(key, places, QUIET_PLACES, LOUD_COSTS)
+    config = preset("laptop")
+
+    def logit(costs):
+        loud = np.percentile(np.asarray(costs, float), LOUD_PLACE, axis=1)
+        loud = loud.clip(1e-6, 1 - 1e-6)  # float32 knows no more
+        return np.log(loud / (1 - loud))
+
+    def moved(std, low, high):
+        children = mutate(key, theta, len(theta), std, low, high)
+        seen = jax.jit(jax.vmap(intrinsic_cost, (0, None)))(children, places)
+        return (logit(seen) - logit(costs)).std()
+
+    near = moved(config.mutation_std, config.mutation_low, config.mutation_high)
+    assert near < 1.0
+    assert moved(0.3, 0.9, 1.1) > 2.0 * near
+
+
 def test_a_graded_start_keeps_to_other_ranges(key, places):
     costs = np.asarray(graded(key, places, (60.0, 70.0), (0.4, 0.5))[1])
     quiet = 100 * (costs < QUIET_COST).mean(1)

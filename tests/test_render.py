@@ -25,6 +25,7 @@ from autocost_jax.viz import gallery, picture, scene
 from autocost_jax.viz.picture import FILMS, FPS, MOST_FRAMES, Job, film_frames
 from autocost_jax.viz.player import replay_page
 from pages import browse, check_page
+from refusals import refused
 from test_scene import still_recording
 
 STEPS = 60
@@ -183,11 +184,7 @@ def test_bad_input_gets_one_line_and_status_2(
     argv, words, capsys, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        main(argv)
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
+    error = refused(main, argv, capsys)
     for word in words:
         assert word in error
     assert not list(tmp_path.iterdir())
@@ -196,18 +193,14 @@ def test_bad_input_gets_one_line_and_status_2(
 @pytest.mark.parametrize("command", ["render", "report"])
 def test_a_page_is_not_written_over_a_configuration(run_dir, capsys, command):
     before = (run_dir / "config.yaml").read_bytes()
-    with pytest.raises(SystemExit) as stop:
-        main([command, "--run", str(run_dir), "--out", str(run_dir / "config.yaml")])
-    assert stop.value.code == 2
-    assert "must be an .html file" in capsys.readouterr().err
+    argv = [command, "--run", str(run_dir), "--out", str(run_dir / "config.yaml")]
+    assert "must be an .html file" in refused(main, argv, capsys)
     assert (run_dir / "config.yaml").read_bytes() == before
 
 
 def test_an_unknown_policy_lists_those_of_the_run(run_dir, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["render", "--run", str(run_dir), "--policy", "best"])
-    assert stop.value.code == 2
-    assert "ppo_seed0" in capsys.readouterr().err
+    argv = ["render", "--run", str(run_dir), "--policy", "best"]
+    assert "ppo_seed0" in refused(main, argv, capsys)
 
 
 @pytest.fixture

@@ -214,7 +214,7 @@ def _evaluate(argv: list[str]) -> None:
     from autocost_jax.runs.limits import require_evaluation
     from autocost_jax.runs.policies import (
         EVALUATION,
-        eval_summary,
+        eval_summaries,
         load_policies,
         policy_files,
         score_line,
@@ -229,8 +229,7 @@ def _evaluate(argv: list[str]) -> None:
     key = jax.random.fold_in(root_key(options.seed), EVALUATION)
     results, _ = run(states, key)
     rows = []
-    for i, file in enumerate(files):
-        row = eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
+    for file, row in zip(files, eval_summaries(results), strict=True):
         rows.append({"policy": file.stem, **row})
         print(score_line(file.stem, row))
     if options.json is not None:

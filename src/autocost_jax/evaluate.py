@@ -10,6 +10,7 @@ from flax import struct
 
 from autocost_jax.agents.base import Agent
 from autocost_jax.envs.env import Env
+from autocost_jax.metrics import mean_of
 from autocost_jax.records import CostInputs, EnvState, EvalResult, Key, Layout
 from autocost_jax.rollout import reset_worlds
 
@@ -141,7 +142,7 @@ def score(episodes: Episodes) -> EvalResult:
         distance_travelled=episodes.distance_travelled,
         outside_share=episodes.steps_outside / valid.shape[0],
         valid=whole,
-        violation_rate=jnp.sum(whole * (ep_cost > 0)) / jnp.sum(whole),
+        violation_rate=mean_of((ep_cost > 0).astype(whole.dtype), whole),
     )
 
 

@@ -66,7 +66,6 @@ __all__ = [
     "RunDirError",
     "check_free_space",
     "config_hash",
-    "episodes_of",
     "estimate_bytes",
     "from_dict",
     "list_stages",
@@ -79,8 +78,6 @@ __all__ = [
     "to_dict",
     "write_atomic",
 ]
-
-EPISODES = 100  # that score an agent unless told otherwise
 
 
 class RunDir:
@@ -351,22 +348,6 @@ class RunDir:
             if self._metrics is not None:
                 os.fsync(self._metrics.fileno())
             return file.stat().st_size if file.exists() else 0
-
-
-def episodes_of(path: Path, resume: bool, asked: int | None) -> int:
-    """Fresh episodes that score an agent: as asked, else as the run began, else 100.
-
-    Raises:
-      ValueError: there are none.
-      RunDirError: there is no run to resume.
-    """
-    count = asked
-    if count is None and resume:
-        count = read_document(path)["facts"].get("num_episodes")
-    count = EPISODES if count is None else count
-    if not isinstance(count, int) or count < 1:
-        raise ValueError(f"number of episodes must be >= 1, got {count}")
-    return count
 
 
 @contextlib.contextmanager

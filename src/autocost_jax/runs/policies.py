@@ -15,8 +15,26 @@ from autocost_jax.envs.env import Env
 from autocost_jax.files import RunDirError, load_arrays, unflatten
 from autocost_jax.population import make_agents
 from autocost_jax.records import EvalResult, Key, root_key
+from autocost_jax.runs.config_files import read_document
 
+EPISODES = 100  # that score an agent unless told otherwise
 EVALUATION = 2**31 - 1  # purpose of the final evaluation's key, beyond any stage
+
+
+def episodes_of(path: Path, resume: bool, asked: int | None) -> int:
+    """Fresh episodes that score an agent: as asked, else as the run began, else 100.
+
+    Raises:
+      ValueError: there are none.
+      RunDirError: there is no run to resume.
+    """
+    count = asked
+    if count is None and resume:
+        count = read_document(path)["facts"].get("num_episodes")
+    count = EPISODES if count is None else count
+    if not isinstance(count, int) or count < 1:
+        raise ValueError(f"number of episodes must be >= 1, got {count}")
+    return count
 
 
 def policy_name(stage: int, algorithm: str) -> str:
@@ -182,6 +200,13 @@ def eval_summary(result: EvalResult) -> dict[str, float | int]:
         "distance_travelled": interval(result.distance_travelled)[0],
         "episodes": count,
     }
+
+
+def eval_summaries(results: EvalResult) -> list[dict[str, float | int]]:
+    """`eval_summary` of each of several policies, fields [P, E]."""
+    results = jax.tree.map(np.asarray, results)
+    each = range(len(results.valid))
+    return [eval_summary(jax.tree.map(lambda x, i=i: x[i], results)) for i in each]
 
 
 def score_line(label: str, row: dict[str, Any]) -> str:

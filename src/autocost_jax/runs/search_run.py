@@ -14,7 +14,7 @@ from autocost_jax.config import SearchConfig
 from autocost_jax.envs.env import Env, make_env
 from autocost_jax.files import flatten
 from autocost_jax.runs import cluster
-from autocost_jax.runs.directory import RunDir, episodes_of, open_run
+from autocost_jax.runs.directory import RunDir, open_run
 from autocost_jax.runs.finish import finish
 from autocost_jax.runs.limits import (
     checkpoint_bytes,
@@ -30,7 +30,7 @@ from autocost_jax.runs.loop import (
     start,
     useful_devices,
 )
-from autocost_jax.runs.policies import policy_name
+from autocost_jax.runs.policies import episodes_of, policy_name
 from autocost_jax.runs.progress import (
     Display,
     format_seconds,
@@ -58,7 +58,7 @@ def describe(config: SearchConfig, env: Env, num_devices: int) -> list[str]:
     if train.segments_per_episode > 1:
         worlds += f" in {train.segments_per_episode} cohorts"
     sizes = "-".join(str(size) for size in agent.hidden_sizes)
-    groups = [config.slots_per_algorithm] * len(config.algorithms)
+    groups = _groups(config)
     memory = training_bytes(train, env, groups, num_devices) / 1e9
     disk = checkpoint_bytes(train, env, sum(groups)) / 1e6
     beside = ", beside the extrinsic cost alone and a margin of 3x"
@@ -83,6 +83,11 @@ def describe(config: SearchConfig, env: Env, num_devices: int) -> list[str]:
     return lines
 
 
+def _groups(config: SearchConfig) -> list[int]:
+    """Slots of each algorithm."""
+    return [config.slots_per_algorithm] * len(config.algorithms)
+
+
 def plan(config: SearchConfig, path: Path, num_devices: int) -> str:
     """What a run in `path` would do; nothing is made there."""
     lines = describe(config, make_env(config.train.env), num_devices)
@@ -97,7 +102,7 @@ def check_memory(
     Raises:
       ValueError: with the estimate and what the device has, if it tells.
     """
-    groups = [config.slots_per_algorithm] * len(config.algorithms)
+    groups = _groups(config)
     need = training_bytes(config.train, env, groups, len(devices))
     epochs = max(map(config.epochs_of, range(config.total_stages)))
     need += 4 * len(TRACKED) * epochs * sum(groups)

@@ -31,7 +31,7 @@ from autocost_jax.population import (
 )
 from autocost_jax.records import Slot, root_key
 from autocost_jax.runs import cluster
-from autocost_jax.runs.directory import RunDir, episodes_of, open_run
+from autocost_jax.runs.directory import RunDir, open_run
 from autocost_jax.runs.limits import (
     require_evaluation,
     require_memory,
@@ -47,7 +47,8 @@ from autocost_jax.runs.loop import (
 )
 from autocost_jax.runs.policies import (
     EVALUATION,
-    eval_summary,
+    episodes_of,
+    eval_summaries,
     load_policies,
     score_line,
 )
@@ -291,11 +292,9 @@ def _finish(
     files, table = [], []
     learners = state.training.learners
     for i, name in enumerate(config.algorithms):
+        actors = jax.tree.map(np.asarray, actor(learners[i].agent))
         for index, (method, seed) in enumerate(config.group(name)):
-            params = jax.tree.map(
-                lambda leaf, i=i, index=index: leaf[index],
-                actor(learners[i].agent),
-            )
+            params = jax.tree.map(lambda leaf, index=index: leaf[index], actors)
             stem = f"{method.label}_seed{seed}"
             files.append(run.write_policy(stem, flatten(params)))
             frozen = int(learners[i].frozen_epoch[index])
@@ -307,8 +306,8 @@ def _finish(
     agent, states = load_policies(env, config.train, files)
     key = root_key(EVALUATION)
     results, _ = make_evaluator(env, agent, num_episodes)(states, key)
-    for i, row in enumerate(table):
-        row |= eval_summary(jax.tree.map(lambda x, i=i: x[i], results))
+    for row, scores in zip(table, eval_summaries(results), strict=True):
+        row |= scores
     run.write_json("evaluation", {"episodes": num_episodes, "rows": table})
     for row in table:
         display.say("  " + score_line(f"{row['method']} seed {row['seed']}", row))

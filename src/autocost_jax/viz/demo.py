@@ -8,15 +8,13 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from autocost_jax.agents.base import actor
 from autocost_jax.config import AgentConfig, TrainConfig, env_config
 from autocost_jax.costs import load_cost
 from autocost_jax.envs.env import make_env
 from autocost_jax.evaluate import first_recording, watch_first
-from autocost_jax.files import load_arrays, unflatten
-from autocost_jax.population import make_agents, make_evaluator
+from autocost_jax.population import make_evaluator
 from autocost_jax.records import root_key
-from autocost_jax.runs.policies import policy_states
+from autocost_jax.runs.policies import load_policies
 from autocost_jax.viz.cost_map import network_cost
 from autocost_jax.viz.report import write_comparison
 from autocost_jax.viz.scene import make_replay
@@ -56,18 +54,11 @@ def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
     """
     train = demo_train()
     env = make_env(train.env)
-    (agent,) = make_agents(("cpo",), train, env)
-    like = actor(agent.init(root_key(0)))
-    folder = resources.files("autocost_jax") / "pretrained" / "policies"
-    loaded = [
-        unflatten(load_arrays(Path(str(folder / f"{name}_cpo.npz")), None), like)
-        for name in LABELS
-    ]
-    acting, states = policy_states(
-        env, train, jax.tree.map(lambda *leaves: np.stack(leaves), *loaded)
-    )
+    folder = Path(str(resources.files("autocost_jax"))) / "pretrained" / "policies"
+    files = [folder / f"{name}_cpo.npz" for name in LABELS]
+    agent, states = load_policies(env, train, files)
     evaluate = make_evaluator(
-        env, acting, num_episodes, keep=first_recording, watch=watch_first
+        env, agent, num_episodes, keep=first_recording, watch=watch_first
     )
     result, kept = evaluate(states, root_key(seed))
     theta = np.asarray(load_cost(FOUND))
