@@ -4,10 +4,10 @@
     python benchmarks/population.py --preset paper --parts mjx closed_form update
     python benchmarks/population.py --preset laptop --parts devices --devices 8
 
-See `autocost_jax.bench`: the search's program and what it is made of (mjx,
-closed_form); one algorithm's programs of 1 to 100 slots, on at most one device a slot
-(slots); 16 slots on 1, 2, 4 ... devices (devices); a compile without and with a cache
-(compile); updates against the devices' own matrix products (update). Writes
+See `autocost_jax.bench` and `programs.py`: the search's program and what it is made of
+(mjx, closed_form); one algorithm's programs of 1 to 100 slots, on at most one device a
+slot (slots); 16 slots on 1, 2, 4 ... devices (devices); a compile without and with a
+cache (compile); updates against the devices' own matrix products (update). Writes
 benchmarks/results/population_PRESET.json and the table of it; parts that are not asked
 for stay as they were.
 """
@@ -20,14 +20,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
+from programs import compile_times, device_speeds, update_speed
+
 from autocost_jax import PRESETS, preset
-from autocost_jax.bench import (
-    compile_times,
-    device_speeds,
-    search_speeds,
-    slot_speeds,
-    update_speed,
-)
+from autocost_jax.bench import search_speeds, slot_speeds
 from autocost_jax.commandline import use_devices
 from autocost_jax.config import Precision, SearchConfig, TrainConfig
 from autocost_jax.runs.directory import run_facts

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from autocost_jax.commandline import use_devices
+from autocost_jax.commandline import use_compile_cache, use_devices
 from autocost_jax.config import AgentConfig
 from autocost_jax.runs.config_files import first_difference
 from autocost_jax.runs.directory import read_config
@@ -57,18 +57,34 @@ def run_part(
       parts: what can be asked for.
       choices: what `--only` may name.
     """
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("part", choices=parts)
+    parser = part_parser(description, parts)
     parser.add_argument("--only", nargs="+", choices=choices, default=())
-    parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--runs", type=Path, help=f"default: runs/{name}")
-    parser.add_argument("--results", type=Path)
     args = parser.parse_args()
     runs = args.runs or Path(f"runs/{name}_smoke" if args.smoke else f"runs/{name}")
     where = runs / "results" if args.smoke else Path(f"experiments/results/{name}")
     options = Options(runs, args.results or where, tuple(args.only), args.smoke)
-    use_devices(None)  # a device a core, before anything of JAX runs
+    use_machine()
     parts[args.part](options)
+
+
+def part_parser(
+    description: str | None, parts: Iterable[str]
+) -> argparse.ArgumentParser:
+    """The flags of every experiment: its part, its size, its folders."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("part", choices=tuple(parts))
+    parser.add_argument("--smoke", action="store_true", help="a minute, no result")
+    parser.add_argument("--runs", type=Path, help="of run directories, below runs/")
+    parser.add_argument("--results", type=Path, help="of JSON, tables and figures")
+    return parser
+
+
+def use_machine() -> None:
+    """A device a core and the compile cache, before anything of JAX runs."""
+    use_compile_cache(True)
+    use_devices(None)
 
 
 def run_if_needed(config: SweepConfig, path: Path, num_episodes: int) -> None:

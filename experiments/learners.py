@@ -4,9 +4,10 @@
     python experiments/learners.py run --only NAME     # some of them
     python experiments/learners.py collect             # JSON and table
 
-Every setting trains PPO-Lagrangian and CPO on Goal-Hazard-Point in closed form for
-512,000 env steps a slot with five seeds and three costs: the extrinsic one alone, and
-with a margin of 2x and 3x. Scores are of 200 fresh episodes a seed, actions sampled.
+Every setting but the last trains PPO-Lagrangian and CPO on Goal-Hazard-Point in closed
+form for 512,000 env steps a slot with five seeds and three costs: the extrinsic one
+alone, and with a margin of 2x and 3x. Scores are of 200 fresh episodes a seed, actions
+sampled.
 What has been measured before and is not in the runs stays in the JSON.
 """
 
@@ -20,7 +21,7 @@ from common import REDUCED, Options, compact, run_if_needed, run_part, t_interva
 
 from autocost_jax.config import EnvConfig, TrainConfig
 from autocost_jax.runs.directory import read_config
-from autocost_jax.runs.sweep import Method, SweepConfig
+from autocost_jax.runs.sweep import AlgorithmName, Method, SweepConfig
 
 STEPS, SEEDS, EPISODES = 512_000, (0, 1, 2, 3, 4), 200
 COSTS = ("extrinsic", "extrinsic+safety_margin_2x", "extrinsic+safety_margin_3x")
@@ -49,10 +50,18 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "32-32, multiplier from 0.5 at 0.01": (8, 1, MILD),
     "and lambda 0.95": (8, 1, SHORT),
     "and a policy that begins all but still": (8, 1, STILL),
-    # Of `laptop` and `search`: beside this 3 passes of the critics.
+    # Of `laptop` and `search`, which have 3 passes of the critics beside.
     "and a multiplier from 1, a KL bound of 0.03, CPO's violation x 1.6": (8, 1, WIDE),
 }
-ALGORITHMS = ("ppo_lagrangian", "cpo")
+OTHERS = "the same with a PID multiplier, and FOCOPS in place of CPO"
+SETTINGS[OTHERS] = (8, 1, WIDE)
+ALGORITHMS: tuple[AlgorithmName, ...] = ("ppo_lagrangian", "cpo")
+OTHER_ALGORITHMS: tuple[AlgorithmName, ...] = ("pid_lagrangian", "focops")
+
+
+def algorithms_of(name: str) -> tuple[AlgorithmName, ...]:
+    """What a setting trains, in the order of the table's columns."""
+    return OTHER_ALGORITHMS if name == OTHERS else ALGORITHMS
 
 
 def config_of(name: str, steps: int = STEPS, episode: int = 1000) -> SweepConfig:
@@ -67,7 +76,7 @@ def config_of(name: str, steps: int = STEPS, episode: int = 1000) -> SweepConfig
     )
     methods = tuple(
         Method(f"{algorithm} {cost}", algorithm, cost)
-        for algorithm in ("ppo_lagrangian", "cpo")
+        for algorithm in algorithms_of(name)
         for cost in COSTS
     )
     return SweepConfig(train=train, methods=methods, seeds=SEEDS)
@@ -117,7 +126,7 @@ def measured(name: str, path: Path) -> dict[str, Any]:
                 for score in ("return", "ep_cost", "violation_rate")
             },
         }
-        for algorithm, cost in itertools.product(ALGORITHMS, COSTS)
+        for algorithm, cost in itertools.product(algorithms_of(name), COSTS)
     ]
     train = config.train
     return {

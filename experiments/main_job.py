@@ -4,6 +4,9 @@
     python experiments/main_job.py validate  # the best costs again, with 5 other seeds
     python experiments/main_job.py collect   # JSON, table, figure
 
+The presets were tuned while seeds 0, 1 and 2 were looked at. `--only untuned` does the
+same with seeds 3, 4 and 5, on which nothing has been tuned, and without controls.
+
 Each search seed is paired with one whose elites are drawn at random under the same
 keys: both meet the same layouts, so that their last stages can be compared. Every run
 can be stopped and started again; finished ones are kept.
@@ -40,7 +43,7 @@ from autocost_jax.runs.sweep import Method, SweepConfig
 from autocost_jax.search.stages import REFERENCES
 from autocost_jax.search.success import is_success
 
-SEEDS = (0, 1, 2)
+SEEDS = {"tuned": (0, 1, 2), "untuned": (3, 4, 5)}
 VALIDATION_SEEDS = (100, 101, 102, 103, 104)
 EPISODES = 100
 MARGIN = "safety_margin_3x"
@@ -53,10 +56,18 @@ def search_dir(runs: Path, selection: str, seed: int) -> Path:
     return runs / f"{selection}_{seed}"
 
 
+def group_of(options: Options) -> str:
+    """Which search seeds are meant."""
+    if len(options.only) > 1:
+        raise SystemExit("main_job: --only takes tuned or untuned, not both")
+    return options.only[0] if options.only else "tuned"
+
+
 def run(options: Options) -> None:
     """The default job as a user runs it, and its controls, which need no finalists."""
-    for selection in ("paper", "random"):
-        for seed in SEEDS:
+    group = group_of(options)
+    for selection in ("paper", "random") if group == "tuned" else ("paper",):
+        for seed in SEEDS[group]:
             out = search_dir(options.runs, selection, seed)
             if (out / "summary.json").exists():
                 continue
@@ -68,9 +79,10 @@ def run(options: Options) -> None:
             subprocess.run([*command, *(["--resume"] if started else own)], check=True)
 
 
-def finished(runs: Path) -> list[Path]:
+def finished(options: Options) -> list[Path]:
     """The searches that have ended."""
-    paths = [search_dir(runs, "paper", seed) for seed in SEEDS]
+    seeds = SEEDS[group_of(options)]
+    paths = [search_dir(options.runs, "paper", seed) for seed in seeds]
     return [path for path in paths if (path / "summary.json").exists()]
 
 
@@ -124,8 +136,13 @@ def validation_table(papers: list[Path]) -> SweepConfig:
 
 def validate(options: Options) -> None:
     """Train and score the table of all finished searches."""
-    table = validation_table(finished(options.runs))
-    run_if_needed(table, options.runs / "validation", num_episodes=EPISODES)
+    table = validation_table(finished(options))
+    run_if_needed(table, validation_dir(options), num_episodes=EPISODES)
+
+
+def validation_dir(options: Options) -> Path:
+    """Where the best costs are trained again."""
+    return options.runs / f"validation_{group_of(options)}"
 
 
 def validation_rows(papers: list[Path], path: Path) -> list[dict[str, Any]]:
@@ -330,14 +347,15 @@ def require_same_job(paths: list[Path]) -> None:
 
 def collect(options: Options) -> None:
     """JSON, table and figure of all runs."""
-    runs, results = options.runs, options.results
-    papers = finished(runs)
+    runs, results, group = options.runs, options.results, group_of(options)
+    papers = finished(options)
     seeds = [read_config(path)[0].seed for path in papers]
     controls = [search_dir(runs, "random", seed) for seed in seeds]
     require_same_job([path for path in (*papers, *controls) if path.exists()])
+    own = " --only untuned" * (group == "untuned")
     result = {
         "command": " && ".join(
-            f"python experiments/main_job.py {part}"
+            f"python experiments/main_job.py {part}{own}"
             for part in ("run", "validate", "collect")
         ),
         "seeds": seeds,
@@ -345,16 +363,17 @@ def collect(options: Options) -> None:
         "searches": [search_row(*pair) for pair in zip(papers, controls, strict=True)],
         "together": fall_of(papers),
         "best": [best_row(path) for path in papers],
-        "validation": validation_rows(papers, runs / "validation"),
+        "validation": validation_rows(papers, validation_dir(options)),
     }
     results.mkdir(parents=True, exist_ok=True)
     text = json.dumps(to_json(result), indent=1, allow_nan=False)
-    (results / "main_job.json").write_text(text + "\n")
-    (results / "main_job.md").write_text(table(result))
-    figure(result, runs, results / "main_job.png")
+    file = results / ("untuned.json" if own else "main_job.json")
+    file.write_text(text + "\n")
+    file.with_suffix(".md").write_text(table(result))
+    figure(result, runs, file.with_suffix(".png"))
 
 
 PARTS = {"run": run, "validate": validate, "collect": collect}
 
 if __name__ == "__main__":
-    run_part("main_job", __doc__, PARTS, ())
+    run_part("main_job", __doc__, PARTS, SEEDS)

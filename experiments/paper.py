@@ -25,10 +25,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import REDUCED, compact, run_if_needed
+from common import REDUCED, compact, part_parser, run_if_needed, use_machine
 
 from autocost_jax import TrainConfig, env_config, load_cost, preset
-from autocost_jax.commandline import use_compile_cache, use_devices
 from autocost_jax.config import Algorithm
 from autocost_jax.runs.config_files import to_json
 from autocost_jax.runs.directory import read_config, read_metrics, run_facts
@@ -527,15 +526,9 @@ def parser(
     scales: Sequence[str] = ("reduced", "reduced_2m", "reduced_10m", "paper"),
 ) -> argparse.ArgumentParser:
     """The flags of an experiment's script."""
-    parser = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("part", choices=tuple(parts))
+    parser = part_parser(description, parts)
     parser.add_argument("--scale", choices=scales, default="reduced")
     parser.add_argument("--world", choices=FOLDERS, default=WORLD)
-    parser.add_argument("--smoke", action="store_true")
-    parser.add_argument("--runs", type=Path, help="default: runs/figures/WORLD/SCALE")
-    parser.add_argument("--results", type=Path)
     return parser
 
 
@@ -547,8 +540,7 @@ def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
     args.runs = args.runs or "runs/figures" / folder
     where = args.runs / "results" if args.smoke else RESULTS / folder
     args.results = args.results or where
-    use_compile_cache(True)
-    use_devices(None)  # a device a core, before anything of JAX runs
+    use_machine()
     return args
 
 

@@ -8,7 +8,8 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).parents[1]
-NEIGHBOURS = ("common", "paper", "robots_tables")  # of scripts, imported by plain name
+# Of scripts, imported by plain name.
+NEIGHBOURS = ("common", "paper", "robots_tables", "programs")
 
 
 def load_script(name: str) -> ModuleType:

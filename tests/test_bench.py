@@ -8,15 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 from autocost_jax import bench
-from autocost_jax.bench import (
-    Speed,
-    compile_times,
-    device_speeds,
-    env_speed,
-    slot_speeds,
-    update_flop,
-    update_speed,
-)
+from autocost_jax.bench import Speed, env_speed, slot_speeds
 from autocost_jax.cli import main
 from autocost_jax.config import EnvConfig, preset
 from autocost_jax.costs import training_cost
@@ -24,6 +16,8 @@ from autocost_jax.envs.env import make_env
 from autocost_jax.population import make_agents
 from autocost_jax.records import CostInputs, Slot, Trajectory
 from scripts import load_script
+
+programs = load_script("benchmarks/programs")
 
 
 def closed_form(env):
@@ -60,8 +54,9 @@ def rates(monkeypatch):
         rate = 1000 * len(calls)
         return Speed("env", "physics", what, worlds, 0.0, rate, 0)
 
-    monkeypatch.setattr(bench, "_program_speed", speed)
-    monkeypatch.setattr(bench, "_matmul_rate", lambda width, devices: 1e12)
+    monkeypatch.setattr(programs, "program_speed", speed)
+    monkeypatch.setattr(bench, "program_speed", speed)
+    monkeypatch.setattr(programs, "matmul_rate", lambda width, devices: 1e12)
     return calls
 
 
@@ -87,9 +82,9 @@ def test_a_timed_call_can_be_one_epoch(monkeypatch, tmp_path):
 
 def test_update_speed_is_the_difference_of_two_programs(rates):
     train = dataclasses.replace(preset("paper").train, num_worlds=4)
-    row = update_speed(train, "cpo", 3, jax.devices()[:1])
+    row = programs.update_speed(train, "cpo", 3, jax.devices()[:1])
     assert row.seconds == 6.0  # 12,000 steps at 1000 less at 2000 a second
-    flop = 3 * update_flop(train, "cpo", make_env(train.env))
+    flop = 3 * programs.update_flop(train, "cpo", make_env(train.env))
     assert row.tera_flop == round(flop / 1e12, 4)
     assert row.share == round(flop / 6.0 / 1e12, 3)
 
@@ -100,7 +95,7 @@ def test_device_speeds_take_powers_of_two(rates, monkeypatch, there, taken):
         bench, "make_population", lambda env, agents, train, devices: devices
     )
     devices = list(range(there))
-    rows = device_speeds(preset("smoke").train, "ppo_lagrangian", 4, devices)
+    rows = programs.device_speeds(preset("smoke").train, "ppo_lagrangian", 4, devices)
     expect = [f"ppo_lagrangian, 4 slots, {count} devices" for count in taken]
     assert [row.what for row in rows] == expect
     assert [call[0] for call in rates] == [devices[:count] for count in taken]
@@ -136,7 +131,7 @@ def test_update_flop_is_what_the_compiler_counts(algorithm):
     assert analysis is not None
     counted = analysis["flops"]
     # On top come the acting and first passes, a line search and all that is no product.
-    assert 0.6 * counted < update_flop(train, algorithm, env) < counted
+    assert 0.6 * counted < programs.update_flop(train, algorithm, env) < counted
 
 
 @pytest.mark.slow
@@ -145,7 +140,7 @@ def test_a_warm_compile_reads_the_cache():
     config = preset("smoke")
     train = dataclasses.replace(config.train, env=closed_form(config.train.env))
     config = dataclasses.replace(config, train=train, algorithms=("ppo_lagrangian",))
-    times = compile_times(config, jax.devices()[:1])
+    times = programs.compile_times(config, jax.devices()[:1])
     assert 0 < times.warm < 0.7 * times.cold
     assert getattr(jax.config, "jax_compilation_cache_dir", None) == before
 

@@ -1,6 +1,9 @@
 """The other commands, in one tiny training run."""
 
 import json
+import os
+import subprocess
+import sys
 
 import jax
 import numpy as np
@@ -179,6 +182,29 @@ def test_a_job_has_less_memory_than_its_machine(monkeypatch, tmp_path):
 def test_unknown_policy_lists_those_of_the_run(trained, capsys):
     argv = ["evaluate", "--run", str(trained), "--policies", "best"]
     assert "ppo_seed0" in refused(main, argv, capsys)
+
+
+@pytest.mark.parametrize(
+    ("settings", "answer"),
+    [
+        ({"JAX_NUM_CPU_DEVICES": "3"}, "3"),
+        ({"XLA_FLAGS": "--xla_force_host_platform_device_count=5"}, "5"),
+        ({"JAX_PLATFORMS": "cuda"}, "JAX finds no device: JAX_PLATFORMS=cuda names"),
+    ],
+)
+def test_the_settings_of_the_user_of_jax_hold(settings, answer):
+    program = (
+        "from autocost_jax.commandline import guarded, use_devices\n"
+        "guarded(lambda: print(len(use_devices(None))), 'autocost')\n"
+    )
+    names = ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES", "JAX_PLATFORMS")
+    known = {name: value for name, value in os.environ.items() if name not in names}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=known | settings, capture_output=True
+    )
+    lines = (done.stdout + done.stderr).decode().splitlines()
+    assert [answer in line for line in lines] == [True]
+    assert done.returncode == (2 if "no device" in answer else 0)
 
 
 def test_no_command_prints_the_commands(capsys):

@@ -18,15 +18,16 @@ from autocost_jax.config import (
 from autocost_jax.config.checks import help_texts
 
 NAN, INF = float("nan"), float("inf")
-COUNT = (0, -1, 1.5, NAN, "3", True)
+LOST = (1e39, 1e-46, 10**400)  # infinity and 0 in float32, and no float at all
+COUNT = (0, -1, 1.5, NAN, "3", True, None, 2**31, 10**25)
 NUMBER = COUNT[1:]
-POSITIVE = (0.0, -1.0, NAN, INF, "1")
-FINITE = (NAN, INF, -INF, "1")
-NOT_NEGATIVE = (-1e-6, NAN, INF)
+POSITIVE = (0.0, -1.0, NAN, INF, "1", True, (), *LOST)
+FINITE = (NAN, INF, -INF, "1", None, *LOST)
+NOT_NEGATIVE = (-1e-6, NAN, INF, None, *LOST)
 
 BAD = {
     EnvConfig: {
-        "task": ("Fly", "", None),
+        "task": ("Fly", "", None, ["Goal"]),
         "robot": ("Submarine",),
         "physics": ("exact",),
         **dict.fromkeys(("num_steps", "frameskip_binom_n", "lidar_num_bins"), COUNT),
@@ -94,10 +95,12 @@ BAD = {
             (-2.0, NAN, 2.0, 2.0),
             (-2.0, -2.0, INF, 2.0),
             (-2.0, -2.0, 2.0),
+            [-2.0, -2.0, 2.0, 2.0],
+            None,
         ),
     },
     AgentConfig: {
-        "hidden_sizes": ((0,), (64, -1), (8.0,)),
+        "hidden_sizes": ((0,), (64, -1), (8.0,), [64, 64], 64, None),
         "log_std_init": FINITE,
         "gamma": (0.0, 1.01, NAN),
         "cost_gamma": (-0.5, 2.0, NAN),
@@ -131,8 +134,8 @@ BAD = {
         "population_chunk": (-1, 0.5),
     },
     SearchConfig: {
-        "seed": (-1, 2**32, 0.5),
-        "algorithms": ((), ("ppo",), ("cpo", "cpo")),
+        "seed": (-1, 2**32, 10**25, 0.5, True, "0", None),
+        "algorithms": ((), ("ppo",), ("cpo", "cpo"), ["cpo"], ([],), 3, None),
         "cost_limit": FINITE,
         "population_size": COUNT,
         "num_elites": (*COUNT, 51),
@@ -165,6 +168,14 @@ def test_bad_values_are_refused_by_name():
                 with pytest.raises(ValueError, match=expected) as caught:
                     kind(**{name: value})
                 assert "\n" not in str(caught.value)
+
+
+def test_a_config_within_another_is_of_its_class():
+    nested = ((TrainConfig, "env"), (TrainConfig, "agent"), (SearchConfig, "train"))
+    for kind, name in nested:
+        for value in (None, {}, AgentConfig):
+            with pytest.raises(ValueError, match=f"^{name} must be of "):
+                kind(**{name: value})
 
 
 @pytest.mark.parametrize("kind", BAD)

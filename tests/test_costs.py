@@ -177,9 +177,9 @@ def test_an_unknown_term_is_answered_with_the_bank(method):
     assert all(name in str(caught.value) for name in TERMS)
 
 
-@pytest.mark.parametrize("weight", ["x", "nan", "inf", "1e999", "-inf"])
+@pytest.mark.parametrize("weight", ["x", "nan", "1e999", "-inf", "1e39", "1e-46"])
 def test_a_weight_is_a_finite_number(weight):
-    with pytest.raises(ValueError, match="must be a finite number"):
+    with pytest.raises(ValueError, match="must be finite in float32"):
         training_cost(f"{weight}*extrinsic")
 
 

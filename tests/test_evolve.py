@@ -5,6 +5,7 @@ import importlib
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from autocost_jax.commandline import use_compile_cache
 from autocost_jax.config import SearchConfig, preset
 from autocost_jax.evolve import evolve
 from autocost_jax.evolve.__main__ import main
+from autocost_jax.files import load_arrays, save_arrays
 from autocost_jax.runs.config_files import first_difference
 from autocost_jax.runs.directory import (
     RunDir,
@@ -191,6 +193,89 @@ def test_the_report_is_made_of_the_run(whole):
     page = (out / "report" / "index.html").read_text()
     assert "Goal-Hazard-Point" in page
     assert "too short to judge safety" in page
+
+
+def _edit(name, change):
+    """Damage a JSON file: its content is replaced by what `change` makes of it."""
+
+    def damage(run):
+        value = json.loads((run / name).read_text())
+        (run / name).write_text(json.dumps(change(value)))
+
+    return damage
+
+
+def _edit_row(change):
+    """Damage the third row of the metrics."""
+
+    def damage(run):
+        lines = (run / "metrics.jsonl").read_text().splitlines()
+        row = json.loads(lines[2])
+        change(row)
+        lines[2] = json.dumps(row)
+        (run / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+
+    return damage
+
+
+def _edit_arrays(name, change):
+    """Damage an .npz."""
+
+    def damage(run):
+        arrays = load_arrays(run / name)
+        change(arrays)
+        save_arrays(run / name, arrays)
+
+    return damage
+
+
+DAMAGES = {
+    "no object": (_edit("cost.json", lambda card: []), "cost.json must hold"),
+    "stage 99": (_edit("cost.json", lambda c: c | {"stage": 99}), "of stage 99"),
+    "index": (_edit("cost.json", lambda c: c | {"index": "0"}), "index '0'"),
+    "no theta": (_edit_arrays("cost.npz", dict.clear), "cost.npz"),
+    "no stage": (_edit_row(lambda row: row.pop("stage")), "row 3 .* stage None"),
+    "no costs": (_edit_row(lambda row: row.pop("cpo/ep_cost")), "bad cpo/ep_cost"),
+    "few slots": (
+        _edit_row(lambda row: row.update({"cpo/ep_cost": [0.0]})),
+        "bad cpo/ep_cost",
+    ),
+    "a stage lost": (lambda run: (run / "stage_00.npz").unlink(), "stage_00.npz is mi"),
+    "a stage cut": (
+        lambda run: os.truncate(run / "stage_01.npz", 900),
+        "stage_01.npz: not a readable",
+    ),
+    "short replay": (
+        _edit_arrays(
+            "replay_best_cpo.npz", lambda a: a.update(reward=a["reward"][:-1])
+        ),
+        "replay_best_cpo.npz",
+    ),
+    "few poses": (
+        _edit_arrays(
+            "replay_best_cpo.npz",
+            lambda a: a.update(qpos=a["qpos"][1:], goal_xy=a["goal_xy"][1:]),
+        ),
+        "50 poses for 50 steps",
+    ),
+    "summary": (
+        _edit("summary.json", lambda s: s | {"rows": [{"cost": "best"}]}),
+        "summary.json has a bad row",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_report_of_damaged_files_names_the_file(whole, tmp_path, name):
+    out, _ = whole
+    run = tmp_path / "run"
+    ignored = shutil.ignore_patterns("checkpoints", "tensorboard")
+    shutil.copytree(out, run, ignore=ignored)
+    damage, words = DAMAGES[name]
+    damage(run)
+    with pytest.raises(RunDirError, match=words) as error:
+        load_report(run)
+    assert "\n" not in str(error.value)
 
 
 def test_killed_and_resumed_is_bit_for_bit_the_same(whole, environment, tmp_path):

@@ -123,8 +123,7 @@ def test_the_crowded_world_has_eight_hazards_and_is_otherwise_the_same():
 def test_each_world_has_folders_of_its_own(world, monkeypatch):
     words = ["x.py", "collect", "--scale", "reduced_10m", "--world", world]
     monkeypatch.setattr(sys, "argv", words)
-    monkeypatch.setattr(paper, "use_devices", lambda number: None)
-    monkeypatch.setattr(paper, "use_compile_cache", lambda on: None)
+    monkeypatch.setattr(paper, "use_machine", lambda: None)
     args = paper.arguments(paper.parser(None))
     folder = "eight_hazards" if "8" in world else world
     assert args.results.parts[-2:] == args.runs.parts[-2:] == (folder, "reduced_10m")

@@ -6,15 +6,12 @@ compile, which is timed by itself and cold unless a compile cache is switched on
 
 import dataclasses
 import functools
-import itertools
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import Mesh, PartitionSpec
 
 from autocost_jax.agents.base import Agent
@@ -56,49 +53,6 @@ class Speed(NamedTuple):
     workspace_bytes: int
 
 
-class CompileTimes(NamedTuple):
-    """Seconds until a search's program is compiled.
-
-    Attributes:
-      env: name of the world.
-      physics: `EnvConfig.physics`.
-      cold: traced and compiled.
-      warm: traced, and read from the compile cache.
-    """
-
-    env: str
-    physics: str
-    cold: float
-    warm: float
-
-
-class UpdateSpeed(NamedTuple):
-    """How near an update comes to the device's own matrix products.
-
-    Attributes:
-      algorithm: whose update.
-      slots: that learn in the program.
-      rows: of a slot's batch.
-      precision: `AgentConfig.critic_precision`.
-      seconds: of the update of all slots.
-      tera_flop: of all slots' matrix products, by `update_flop`.
-      tera_flop_per_second: the update's rate.
-      matmul_tera_flop_per_second: of a chain of square products of the hidden width,
-        on the same devices.
-      share: of the two rates.
-    """
-
-    algorithm: str
-    slots: int
-    rows: int
-    precision: str
-    seconds: float
-    tera_flop: float
-    tera_flop_per_second: float
-    matmul_tera_flop_per_second: float
-    share: float
-
-
 def env_speed(
     config: EnvConfig, batch: int, devices: Sequence[Any], physics_only: bool = False
 ) -> Speed:
@@ -133,9 +87,9 @@ def env_speed(
     start = time.perf_counter()
     compiled = program.lower((worlds, each)).compile()
     compile_seconds = time.perf_counter() - start
-    reset_seconds, worlds = _timed(reset, keys)
+    reset_seconds, worlds = timed(reset, keys)
     worlds, each = compiled((worlds, each))  # warm up
-    seconds, (worlds, each) = _timed(compiled, (worlds, each))
+    seconds, (worlds, each) = timed(compiled, (worlds, each))
     if bool(worlds.failed.any()):
         raise RuntimeError(f"a world of {config.name} met a non-finite number")
     per_step = seconds / (batch * num_steps)
@@ -161,12 +115,12 @@ def search_speeds(config: SearchConfig, devices: Sequence[Any]) -> list[Speed]:
     size, train = config.population_size, config.train
     env = make_env(train.env)
     agents = make_agents(config.algorithms, train, env)
-    slots = tuple(_slots(size) for _ in agents)
-    runs = (("with updates", agents), ("rollout alone", tuple(map(_idle, agents))))
+    slots = tuple(extrinsic_slots(size) for _ in agents)
+    runs = (("with updates", agents), ("rollout alone", tuple(map(idle, agents))))
     batch = size * len(agents) * train.num_worlds * train.segments_per_episode
     parts = [env_speed(train.env, batch, devices, only) for only in (False, True)]
     return parts + [
-        _program_speed(
+        program_speed(
             train,
             make_population(env, kind, train, devices=devices),
             slots,
@@ -174,31 +128,6 @@ def search_speeds(config: SearchConfig, devices: Sequence[Any]) -> list[Speed]:
         )
         for what, kind in runs
     ]
-
-
-def compile_times(config: SearchConfig, devices: Sequence[Any]) -> CompileTimes:
-    """Seconds to compile a search's program without and with a compile cache."""
-    train = config.train
-    env = make_env(train.env)
-    agents = make_agents(config.algorithms, train, env)
-    slots = tuple(_slots(config.population_size) for _ in agents)
-    before = getattr(jax.config, "jax_compilation_cache_dir", None)
-    seconds = []
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            jax.config.update("jax_compilation_cache_dir", folder)
-            for _ in range(2):
-                compilation_cache.reset_cache()
-                jax.clear_caches()
-                population = make_population(env, agents, train, devices=devices)
-                state = population.init(slots)
-                start = time.perf_counter()
-                population.compile(state, slots)
-                seconds.append(round(time.perf_counter() - start, 1))
-        finally:
-            jax.config.update("jax_compilation_cache_dir", before)
-            compilation_cache.reset_cache()
-    return CompileTimes(train.env.name, train.env.physics, *seconds)
 
 
 def slot_speeds(
@@ -212,21 +141,10 @@ def slot_speeds(
     One slot is what an ordinary run trains; N of them in turn take N times as long.
     """
     programs = [(size, devices[:size], f"{size} slots") for size in sizes]
-    return _algorithm_speeds(train, algorithm, programs)
+    return algorithm_speeds(train, algorithm, programs)
 
 
-def device_speeds(
-    train: TrainConfig, algorithm: Algorithm, size: int, devices: Sequence[Any]
-) -> list[Speed]:
-    """One program of `size` slots on 1, 2, 4, 8 ... of the devices."""
-    counts = [2**power for power in range(len(devices).bit_length())]
-    programs = [
-        (size, devices[:count], f"{size} slots, {count} devices") for count in counts
-    ]
-    return _algorithm_speeds(train, algorithm, programs)
-
-
-def _algorithm_speeds(
+def algorithm_speeds(
     train: TrainConfig,
     algorithm: Algorithm,
     programs: Sequence[tuple[int, Sequence[Any], str]],
@@ -235,107 +153,25 @@ def _algorithm_speeds(
     env = make_env(train.env)
     agents = make_agents((algorithm,), train, env)
     return [
-        _program_speed(
+        program_speed(
             train,
             make_population(env, agents, train, devices=devices),
-            (_slots(size),),
+            (extrinsic_slots(size),),
             f"{algorithm}, {what}",
         )
         for size, devices, what in programs
     ]
 
 
-def update_speed(
-    train: TrainConfig, algorithm: Algorithm, size: int, devices: Sequence[Any]
-) -> UpdateSpeed:
-    """Seconds of `size` slots' updates, against the devices' matrix products.
-
-    The difference of a program with updates and one without. PPO's stop on the KL is
-    off, so that all passes are made.
-    """
-    agent = dataclasses.replace(train.agent, kl_stop_factor=1e9)
-    train = dataclasses.replace(train, agent=agent, chunk_epochs=1)
-    env = make_env(train.env)
-    learner = make_agents((algorithm,), train, env)[0]
-    seconds = []
-    for kind in (learner, _idle(learner)):
-        population = make_population(env, (kind,), train, devices=devices)
-        speed = _program_speed(train, population, (_slots(size),), algorithm)
-        steps = speed.worlds * train.epoch_steps
-        seconds.append(steps / speed.env_steps_per_second)
-    spent = seconds[0] - seconds[1]
-    flop = size * update_flop(train, algorithm, env)
-    peak = _matmul_rate(max(agent.hidden_sizes), devices)
-    return UpdateSpeed(
-        algorithm=algorithm,
-        slots=size,
-        rows=train.num_worlds * train.env.num_steps,
-        precision=agent.critic_precision,
-        seconds=round(spent, 3),
-        tera_flop=round(flop / 1e12, 4),
-        tera_flop_per_second=round(flop / spent / 1e12, 4),
-        matmul_tera_flop_per_second=round(peak / 1e12, 4),
-        share=round(flop / spent / peak, 3),
-    )
-
-
-def update_flop(train: TrainConfig, algorithm: Algorithm, env: Env) -> float:
-    """Floating-point operations of the matrix products of one slot's update.
-
-    With W weights, W_0 of them in the first layer, and R rows: a forward pass is
-    2 R W, a gradient 2 R (3 W - W_0), a Fisher product 4 R W a direction.
-    """
-    agent = train.agent
-    rows = train.num_worlds * train.env.num_steps
-    hidden = (env.observation_size, *agent.hidden_sizes)
-    first = hidden[0] * hidden[1] if len(hidden) > 1 else 0
-
-    def weights(outputs: int) -> int:
-        return sum(a * b for a, b in itertools.pairwise((*hidden, outputs)))
-
-    policy, critic = weights(env.action_size), weights(1)
-
-    def gradient(count: int) -> int:
-        return 2 * rows * (3 * count - first)
-
-    total = 2 * agent.value_passes * gradient(critic)
-    if algorithm == "cpo":
-        products = agent.cg_iterations + 1
-        return total + products * 2 * 4 * rows * policy + 2 * gradient(policy)
-    total += agent.policy_passes * gradient(policy)
-    if agent.policy_minibatches > 1:  # the whole batch's KL before each pass
-        total += agent.policy_passes * 2 * rows * policy
-    return total
-
-
-def _matmul_rate(width: int, devices: Sequence[Any]) -> float:
-    """Operations a second of square float32 products, on all devices together."""
-    rows, count = 4096, 50
-    mesh, split = Mesh(devices, ("row",)), PartitionSpec("row")
-
-    @functools.partial(
-        jax.shard_map, mesh=mesh, in_specs=split, out_specs=split, check_vma=False
-    )
-    def chain(x: jax.Array) -> jax.Array:
-        square = jnp.full((width, width), 1.0 / width, x.dtype)
-        with jax.default_matmul_precision("highest"):
-            return jax.lax.fori_loop(0, count, lambda _, x: x @ square, x)
-
-    x = jnp.ones((rows * len(devices), width), jnp.float32)
-    program = jax.jit(chain)
-    _timed(program, x)  # compiles and warms up
-    seconds, _ = _timed(program, x)
-    return count * 2 * x.shape[0] * width**2 / seconds
-
-
-def _idle(agent: Agent) -> Agent:
+def idle(agent: Agent) -> Agent:
     """An agent that acts and does not learn."""
     return agent._replace(update=lambda state, *_: (state, {"idle": jnp.zeros(())}))
 
 
-def _program_speed(
+def program_speed(
     train: TrainConfig, population: Population, slots: tuple[Slot, ...], what: str
 ) -> Speed:
+    """Training by one program, compiled anew; `what` says in words what it runs."""
     state = population.init(slots)
     start = time.perf_counter()
     compiled = population.compile(state, slots)
@@ -361,7 +197,7 @@ def _program_speed(
     )
 
 
-def _slots(size: int) -> Slot:
+def extrinsic_slots(size: int) -> Slot:
     """Slots [size] of the extrinsic cost alone, one seed each."""
     cost = training_cost("extrinsic", limit=0.0)
     ones = jnp.ones((), jnp.float32)
@@ -384,7 +220,7 @@ def _random_steps(
     return worlds, jax.vmap(lambda key: jax.random.fold_in(key, num_steps))(keys)
 
 
-def _timed(function: Any, *inputs: Any) -> tuple[float, Any]:
+def timed(function: Any, *inputs: Any) -> tuple[float, Any]:
     """Shortest of `REPEATS` calls in seconds, and the last output."""
     best, output = float("inf"), None
     for _ in range(REPEATS):

@@ -6,6 +6,7 @@ import io
 import logging
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -117,21 +118,44 @@ def fail(message: str, status: int = BAD_INPUT) -> None:
 def guarded(main: Callable[[], None], prog: str) -> None:
     """Run a command; expected errors become one line and an exit status.
 
-    Bad input is status 2, a run that could not go on is 1, Ctrl-C is 130.
+    Bad input is status 2, a run that could not go on is 1, Ctrl-C is 130, SIGTERM 143.
     """
     from autocost_jax.files import DiskFullError
     from autocost_jax.runs.cluster import is_lost_peer
+    from autocost_jax.runs.stopping import Stopped
 
     try:
-        main()
+        _with_devices(main)
     except ValueError as error:
         fail(f"{prog}: {error}", status=1 if is_lost_peer(error) else BAD_INPUT)
     except OSError as error:
         fail(f"{prog}: {error.strerror or error}: {error.filename or ''}")
     except (DiskFullError, RuntimeError) as error:
         fail(f"{prog}: {error}", status=1)
+    except Stopped as stop:
+        words = f"stopped after a checkpoint; go on with: {prog} --resume --out"
+        path = shlex.quote(str(stop.path))
+        fail(f"{prog}: {words} {path}", status=128 + stop.signum)
     except KeyboardInterrupt:
         fail(f"{prog}: interrupted; a run goes on with --resume", status=130)
+
+
+def _with_devices(main: Callable[[], None]) -> None:
+    """Run a command; JAX's bare AssertionError where it has no device gets words."""
+    try:
+        main()
+    except AssertionError:
+        import jax
+
+        try:
+            jax.devices()
+        except AssertionError:
+            platforms = os.environ.get("JAX_PLATFORMS")
+            raise ValueError(
+                f"JAX finds no device: JAX_PLATFORMS={platforms} names none that is "
+                "there and that JAX is installed for"
+            ) from None
+        raise
 
 
 def quiet() -> None:
@@ -175,6 +199,13 @@ def _cache_directory() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "autocost_jax"
 
 
+def _has_split_cpu() -> bool:
+    """Whether the user has said into how many devices JAX splits a CPU."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    is_flag = "--xla_force_host_platform_device_count" in flags
+    return is_flag or "JAX_NUM_CPU_DEVICES" in os.environ
+
+
 def use_devices(
     count: int | None,
     coordinator: str | None = None,
@@ -183,7 +214,8 @@ def use_devices(
 ) -> Sequence[Any]:
     """The devices a run uses; on a CPU one for each core unless told otherwise.
 
-    Must be called before anything of JAX has run: a CPU is split into devices then.
+    $JAX_NUM_CPU_DEVICES, or XLA's flag for it, says otherwise, too. Must be called
+    before anything of JAX has run: a CPU is split into devices then.
 
     Args:
       count: number of devices, None for all.
@@ -199,8 +231,9 @@ def use_devices(
     from autocost_jax.runs import cluster
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    with contextlib.suppress(RuntimeError):  # too late to split: take what is there
-        jax.config.update("jax_num_cpu_devices", cores)
+    if not _has_split_cpu():
+        with contextlib.suppress(RuntimeError):  # too late: take what is there
+            jax.config.update("jax_num_cpu_devices", cores)
     cluster.join(coordinator, num_processes, process_id)
     devices = jax.devices()
     if coordinator is not None and count is not None:

@@ -8,7 +8,6 @@ passing a longer bank.
 """
 
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from autocost_jax.config import LIDAR_BINS, THETA_SIZES
+from autocost_jax.config.checks import FINITE, require
 from autocost_jax.files import load_arrays
 from autocost_jax.records import CostInputs, TrainingCost
 
@@ -195,8 +195,8 @@ def parse_cost(
     A configuration is read and checked with it before a run's processes meet.
     Arguments and errors are those of `training_cost`.
     """
-    if isinstance(limit, float | int) and not np.isfinite(limit):
-        raise ValueError(f"limit must be finite, got {limit}")
+    if isinstance(limit, float | int):
+        require(FINITE.holds(limit), "limit", FINITE.allowed, limit)
     names = [term.name for term in bank]
     weights = np.zeros(len(bank), np.float32)
     for part in method.split("+"):
@@ -209,11 +209,9 @@ def parse_cost(
         try:
             weight = float(factor) if factor else 1.0
         except ValueError:
-            weight = math.nan
-        if not math.isfinite(weight):
-            raise ValueError(
-                f"weight {factor!r} in method {method!r} must be a finite number"
-            )
+            weight = None  # no number
+        what = f"weight {factor!r} in method {method!r}"
+        require(FINITE.holds(weight), what, FINITE.allowed, weight)
         weights[names.index(name.strip())] += weight
     if theta is None:
         uses_network = "intrinsic" in names and weights[names.index("intrinsic")] != 0

@@ -92,6 +92,17 @@ def test_impossible_configuration_is_refused():
         make_env(TIGHT)
 
 
+def test_keepouts_larger_than_the_arena_are_refused_at_once():
+    """Trial layouts of 5000 objects would take an hour."""
+    with pytest.raises(ValueError, match="100% of 256"):
+        make_env(EnvConfig(hazards_num=5000))
+    few = layouts.make_arena(EnvConfig())
+    assert not layouts.is_too_full(few)
+    # 6 keepouts of 0.4 m cover 3.0 of 16 square metres, with gaps of 1 m 15 of 25.
+    assert not layouts.is_too_full(few._replace(margin=1.0))
+    assert layouts.is_too_full(few._replace(margin=3.0))
+
+
 def test_default_configuration_is_far_from_refused(arena):
     assert layouts.host_failure_share(arena) == 0.0
 

@@ -5,10 +5,11 @@ to the checks, command lines and `autocost info` show the help.
 """
 
 import dataclasses
-import math
 import numbers
 from collections.abc import Callable
 from typing import Any, NamedTuple, get_args
+
+LEAST, MOST = 2.0**-126, (2 - 2.0**-23) * 2.0**127  # float32's, apart from 0
 
 
 class Check(NamedTuple):
@@ -24,33 +25,53 @@ class Check(NamedTuple):
 
 
 def is_finite(value: Any) -> bool:
-    """Whether a value is a finite real number."""
-    return isinstance(value, numbers.Real) and math.isfinite(value)
+    """Whether a value is a number that is finite, and not lost, in float32."""
+    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return is_number and (value == 0 or LEAST <= abs(value) <= MOST)
 
 
-def is_integer(value: Any) -> bool:
-    """Whether a value is an integer, which a bool is not."""
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+def is_integer(value: Any, bound: int = 2**31) -> bool:
+    """Whether a value is an integer, which a bool is not, of a size below a bound."""
+    is_number = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    return is_number and abs(value) < bound
 
 
-FINITE = Check("finite", is_finite)
-POSITIVE = Check("finite and > 0", lambda x: is_finite(x) and x > 0)
-POSITIVE_OR_NONE = Check("finite and > 0", lambda x: x is None or POSITIVE.holds(x))
-NOT_NEGATIVE = Check("finite and >= 0", lambda x: is_finite(x) and x >= 0)
-COUNT = Check("an integer >= 1", lambda x: is_integer(x) and x >= 1)
-NUMBER = Check("an integer >= 0", lambda x: is_integer(x) and x >= 0)
+def is_tuple_of(holds: Callable[[Any], bool], value: Any) -> bool:
+    """Whether a value is a tuple (a list cannot be hashed) of what is allowed."""
+    return isinstance(value, tuple) and all(map(holds, value))
+
+
+FINITE = Check("finite in float32", is_finite)
+POSITIVE = Check("finite in float32 and > 0", lambda x: is_finite(x) and x > 0)
+POSITIVE_OR_NONE = Check(
+    f"null, or {POSITIVE.allowed}", lambda x: x is None or POSITIVE.holds(x)
+)
+NOT_NEGATIVE = Check("finite in float32 and >= 0", lambda x: is_finite(x) and x >= 0)
+COUNT = Check("an integer in [1, 2**31)", lambda x: is_integer(x) and x >= 1)
+NUMBER = Check("an integer in [0, 2**31)", lambda x: is_integer(x) and x >= 0)
 SWITCH = Check("true or false", lambda x: isinstance(x, bool))
 DISCOUNT = Check("in (0, 1]", lambda x: is_finite(x) and 0 < x <= 1)
 SHARE = Check("in [0, 1]", lambda x: is_finite(x) and 0 <= x <= 1)
 RATIO = Check("in (0, 1)", lambda x: is_finite(x) and 0 < x < 1)
-SEED = Check("an integer in [0, 2**32)", lambda x: is_integer(x) and 0 <= x < 2**32)
-COUNTS = Check("a tuple of integers >= 1", lambda x: all(map(COUNT.holds, x)))
+SEED = Check("an integer in [0, 2**32)", lambda x: is_integer(x, 2**32) and x >= 0)
+COUNTS = Check(
+    "a tuple of integers in [1, 2**31)", lambda x: is_tuple_of(COUNT.holds, x)
+)
+CORNERS = Check(
+    "(xmin, ymin, xmax, ymax), finite in float32",
+    lambda x: is_tuple_of(is_finite, x) and len(x) == 4,
+)
+
+
+def is_distinct(values: tuple[Any, ...]) -> bool:
+    """Whether no value is there twice."""
+    return len(set(values)) == len(values)
 
 
 def one_of(kind: Any) -> Check:
     """One of the strings of a `Literal`."""
     known = get_args(kind)
-    return Check(f"one of {', '.join(known)}", lambda x: x in known)
+    return Check(f"one of {', '.join(known)}", lambda x: type(x) is str and x in known)
 
 
 def some_of(kind: Any) -> Check:
@@ -58,7 +79,7 @@ def some_of(kind: Any) -> Check:
     known = get_args(kind)
     return Check(
         f"distinct names out of {', '.join(known)}",
-        lambda x: len(x) > 0 and len(set(x)) == len(x) and set(x) <= set(known),
+        lambda x: x != () and is_tuple_of(known.__contains__, x) and is_distinct(x),
     )
 
 
@@ -80,10 +101,13 @@ def require(ok: bool, name: str, allowed: str, got: Any) -> None:
 
 
 def check_fields(config: Any) -> None:
-    """Hold every field to its check; a `ValueError` says what is allowed."""
+    """Hold every field to its check, or its class; a `ValueError` says what it is."""
     for field in dataclasses.fields(config):
         check, value = field.metadata.get("check"), getattr(config, field.name)
-        if check is not None:
+        if isinstance(field.type, type) and dataclasses.is_dataclass(field.type):
+            kind = field.type
+            require(isinstance(value, kind), field.name, f"of {kind.__name__}", value)
+        elif check is not None:
             require(check.holds(value), field.name, check.allowed, value)
 
 

@@ -156,8 +156,19 @@ def place_on_host(arena: Arena, draws: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return placed, success
 
 
+def is_too_full(arena: Arena) -> bool:
+    """Whether the keepouts, which must not overlap, are larger than the arena."""
+    keepout, gap = arena.keepout, arena.margin
+    corner = (arena.low - keepout[:, None]).min(0)
+    far = (arena.low + arena.size + keepout[:, None]).max(0)
+    needed = np.pi * np.sum((keepout + gap / 2) ** 2)
+    return bool(needed > np.prod(far - corner + gap))
+
+
 def host_failure_share(arena: Arena) -> float:
     """Share of `HOST_LAYOUTS` layouts that fail in all `NUM_RESTARTS` attempts."""
+    if is_too_full(arena):
+        return 1.0
     rng = np.random.default_rng(0)
     open_layouts = HOST_LAYOUTS
     for _ in range(NUM_RESTARTS):

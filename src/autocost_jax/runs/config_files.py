@@ -12,6 +12,7 @@ import difflib
 import hashlib
 import importlib.metadata
 import json
+import numbers
 import platform
 import subprocess
 from collections.abc import Mapping
@@ -239,6 +240,36 @@ def list_stages(path: str | Path) -> dict[int, Path]:
     return dict(sorted((int(key), file) for key, file in numbered if key.isdecimal()))
 
 
+def stage_files(path: str | Path) -> list[Path]:
+    """The files of a run's stages, from the first on.
+
+    Raises:
+      RunDirError: one of them is missing.
+    """
+    files = list_stages(path)
+    for number, found in enumerate(files):
+        if found != number:
+            raise RunDirError(f"{path}: stage_{number:02d}.npz is missing")
+    return list(files.values())
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """The object of a JSON file; an empty one if there is no such file.
+
+    Raises:
+      RunDirError: it holds no JSON object.
+    """
+    if not file.exists():
+        return {}
+    try:
+        value = json.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise RunDirError(f"{file} is not readable: {error}") from None
+    if not isinstance(value, dict):
+        raise RunDirError(f"{file} must hold a JSON object, got {value!r:.40}")
+    return value
+
+
 def to_json(value: Any) -> Any:
     """Strict JSON: arrays as lists, non-finite numbers as strings."""
     if isinstance(value, Mapping):
@@ -312,9 +343,9 @@ def _encode(value: Any, hint: Any, name: str) -> Any:
     if value is None or isinstance(value, bool | str):
         return value
     # 1 in a field of floats is stored as 1.0: they are the same config.
-    if isinstance(value, int) and (float not in kinds or int in kinds):
+    if isinstance(value, numbers.Integral) and (float not in kinds or int in kinds):
         return int(value)
-    if isinstance(value, int | float):
+    if isinstance(value, numbers.Real):  # NumPy's numbers among them
         return float(value)
     raise ValueError(f"{name}: a {type(value).__name__} cannot be stored in a config")
 

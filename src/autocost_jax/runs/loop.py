@@ -17,6 +17,7 @@ import numpy as np
 from autocost_jax.runs import cluster
 from autocost_jax.runs.directory import RunDir, check_free_space, estimate_bytes
 from autocost_jax.runs.progress import Display
+from autocost_jax.runs.stopping import Stopped, noted_signals
 
 CHECKPOINT_SECONDS = 15.0  # at least, between two checkpoints within a stage
 
@@ -103,20 +104,28 @@ def keep_chunks(
 
     Returns:
       The last state, its training fetched.
+
+    Raises:
+      Stopped: Ctrl-C or another signal to stop has come; a checkpoint has been written.
     """
     saved_at = -np.inf  # the first chunk is kept, whatever comes
-    for chunk in chunks:
-        state = chunk.state
-        if run is not None:
-            for k, row in enumerate(chunk.rows):
-                run.log_metrics(row, chunk.first + k)
-        is_due = chunk.is_end or time.monotonic() - saved_at >= CHECKPOINT_SECONDS
-        if is_due or jax.process_count() > 1:  # clocks differ, and all must take part
-            saved = state.replace(training=fetch(state.training))
+    with noted_signals() as signal_that_came:
+        for chunk in chunks:
+            state = chunk.state
             if run is not None:
-                after = chunk.first + len(chunk.rows)
-                run.save_checkpoint(saved, after, chunk.position)
-            saved_at = time.monotonic()
+                for k, row in enumerate(chunk.rows):
+                    run.log_metrics(row, chunk.first + k)
+            stop = signal_that_came()
+            is_due = time.monotonic() - saved_at >= CHECKPOINT_SECONDS
+            is_due |= chunk.is_end or stop is not None
+            if is_due or jax.process_count() > 1:  # clocks differ, all must take part
+                saved = state.replace(training=fetch(state.training))
+                if run is not None:
+                    after = chunk.first + len(chunk.rows)
+                    run.save_checkpoint(saved, after, chunk.position)
+                saved_at = time.monotonic()
+            if stop is not None and run is not None:
+                raise Stopped(stop, run.path)
     return state.replace(training=fetch(state.training))
 
 

@@ -1,7 +1,6 @@
 """One episode of a policy, recorded and shown: a page, and a film if asked for."""
 
 import dataclasses
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +11,13 @@ import numpy as np
 
 from autocost_jax.agents.base import Agent
 from autocost_jax.config import EnvConfig, TrainConfig, env_config
+from autocost_jax.costs import load_cost
 from autocost_jax.envs.env import Env, make_env
 from autocost_jax.evaluate import Recording, first_recording, watch_first
-from autocost_jax.files import load_arrays, write_atomic
+from autocost_jax.files import write_atomic
 from autocost_jax.population import make_evaluator
 from autocost_jax.records import root_key
+from autocost_jax.runs.config_files import read_object
 from autocost_jax.runs.policies import (
     EVALUATION,
     load_policies,
@@ -84,10 +85,9 @@ def script_player(env: str, policy: str) -> Player:
 
 def best_policy(run: Path) -> str | None:
     """The first algorithm's policy under a search's best cost; None if unknown."""
-    card = _card(run)
-    if not card:
-        return None
-    return f"best_{next(iter(card['evaluation']))}"
+    evaluation = read_object(run / "cost.json").get("evaluation")
+    names = list(evaluation) if isinstance(evaluation, dict) else []
+    return f"best_{names[0]}" if names else None
 
 
 def run_player(
@@ -111,9 +111,9 @@ def run_player(
         agent, states = load_policies(env, train, [file])
         return agent, jax.tree.map(lambda leaf: leaf[0], states)
 
-    card, theta = _card(run), None
-    if card and file.stem.startswith("best_"):
-        theta = load_arrays(run / "cost.npz", None)["theta"]
+    theta, cost = None, run / "cost.npz"
+    if cost.exists() and file.stem.startswith("best_"):
+        theta = np.asarray(load_cost(cost))
     return Player(
         world=train.env.name,
         config=train.env,
@@ -123,11 +123,6 @@ def run_player(
         page=run / "replays" / f"{file.stem}.html",
         theta=theta,
     )
-
-
-def _card(run: Path) -> dict[str, Any]:
-    file = run / "cost.json"
-    return json.loads(file.read_text()) if file.exists() else {}
 
 
 def record_episode(player: Player, seed: int) -> Recording:

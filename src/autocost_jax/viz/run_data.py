@@ -1,18 +1,20 @@
 """From a run directory to its report."""
 
-import json
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from autocost_jax.config import SearchConfig
+from autocost_jax.costs import load_cost
 from autocost_jax.es import Fitness, pool, rank
-from autocost_jax.evaluate import Recording
 from autocost_jax.files import RunDirError, load_arrays
 from autocost_jax.population import run_compiled
-from autocost_jax.runs.directory import list_stages, read_config, read_metrics
+from autocost_jax.runs.config_files import read_object, stage_files
+from autocost_jax.runs.directory import read_config, read_metrics
 from autocost_jax.runs.labels import COST_LABELS, algorithm_label
+from autocost_jax.runs.recordings import read_recording
 from autocost_jax.search.evolution import pick_label
 from autocost_jax.search.stages import REFERENCES, deal
 from autocost_jax.viz.cost_map import network_cost
@@ -37,11 +39,12 @@ def load_report(path: str | Path) -> ReportData:
     """
     path = Path(path)
     config, facts = read_config(path, SearchConfig)
-    rows = read_metrics(path)
-    stages = tuple(_stage(config, file) for file in list_stages(path).values())
-    card = _read_json(path / "cost.json")
+    rows = _rows(config, path)
+    files = stage_files(path)
+    stages = tuple(_stage(config, file) for file in files)
+    card = read_object(path / "cost.json")
     best = _best(config, stages, card)
-    summary = {} if best is None else _read_json(path / "summary.json")
+    summary = {} if best is None else read_object(path / "summary.json")
     obstacle = config.train.env.constrained[0]
     return ReportData(
         title=f"AutoCost on {config.train.env.name}",
@@ -54,23 +57,11 @@ def load_report(path: str | Path) -> ReportData:
         best=best,
         curves=tuple(_curves(config, rows)),
         replays=() if best is None else _replays(path, config),
-        summary=tuple(
-            SummaryRow(
-                algorithm=row["algorithm"],
-                cost=row["cost"],
-                ep_return=row["return"],
-                ep_cost=row["ep_cost"],
-                violation_rate=row["violation_rate"],
-                outside_share=row["outside_share"],
-                seeds=row["seeds"],
-                episodes=row["episodes"],
-            )
-            for row in summary.get("rows", ())
-        ),
+        summary=_summary(path, summary),
         conclusion=summary.get("conclusion", ""),
         references=tuple(
             score
-            for number, file in enumerate(list_stages(path).values())
+            for number, file in enumerate(files)
             for score in _references(config, number, load_arrays(file))
         ),
         can_violate=_can_violate(config, rows),
@@ -117,13 +108,32 @@ def _can_violate(config: SearchConfig, rows: list[dict[str, Any]]) -> bool:
     return not rows or any(np.max(row[name]) > 0 for row in rows for name in names)
 
 
-def _read_json(file: Path) -> dict[str, Any]:
-    if not file.exists():
-        return {}
+def _rows(config: SearchConfig, path: Path) -> list[dict[str, Any]]:
+    """The run's metrics; each row has what the report draws of every slot."""
+    rows, slots = read_metrics(path), config.slots_per_algorithm
+    keys = ("ep_return", "ep_cost", "ep_total_cost", "violating_worlds")
+    names = [f"{name}/{key}" for name in config.algorithms for key in keys]
+    for number, row in enumerate(rows, start=1):
+        stage, epoch = row.get("stage"), row.get("epoch")
+        odd = [name for name in names if np.shape(row.get(name)) != (slots,)]
+        is_known = stage in range(config.total_stages) and isinstance(epoch, int)
+        if odd or not is_known:
+            what = odd[0] if odd else f"stage {stage!r}, epoch {epoch!r}"
+            raise RunDirError(f"{path}: row {number} of its metrics has a bad {what}")
+    return rows
+
+
+def _summary(path: Path, summary: dict[str, Any]) -> tuple[SummaryRow, ...]:
+    """The rows of summary.json; its "return" is what Python calls `ep_return`."""
+    names = {field.name: field.name for field in dataclasses.fields(SummaryRow)}
+    names |= {"ep_return": "return"}
     try:
-        return json.loads(file.read_text())
-    except ValueError as error:
-        raise RunDirError(f"{file} is not readable: {error}") from None
+        return tuple(
+            SummaryRow(**{name: row[key] for name, key in names.items()})
+            for row in summary.get("rows", ())
+        )
+    except (KeyError, TypeError) as error:
+        raise RunDirError(f"{path / 'summary.json'} has a bad row: {error}") from None
 
 
 def _stage(config: SearchConfig, file: Path) -> StageRecord:
@@ -178,6 +188,8 @@ def _best(
     first = int(run_compiled(rank, fitness, zero_tolerance=tolerance)[0])
     number, index = divmod(first, config.population_size)
     number, index = card.get("stage", number), card.get("index", index)
+    if number not in range(len(stages)) or index not in range(config.population_size):
+        raise RunDirError(f"cost.json is of stage {number!r}, index {index!r}: no such")
     stage = stages[number]
     is_zero = bool(stage.zero_violation[index])
     shown = ("environment", "judged_by", "search_score", "search_return")
@@ -219,21 +231,20 @@ def _curves(config: SearchConfig, rows: list[dict[str, Any]]) -> list[Curve]:
 
 def _replays(path: Path, config: SearchConfig) -> tuple[Replay, ...]:
     """The recordings that the run has left, those of the best cost first."""
-    cost = path / "cost.npz"
-    if not cost.exists():
+    if not (path / "cost.npz").exists():
         return ()
-    theta = load_arrays(cost, None)["theta"]
+    theta = np.asarray(load_cost(path / "cost.npz"))
     replays = []
     for kind in ("best", *REFERENCES):
         for name in config.algorithms:
             file = path / f"replay_{kind}_{name}.npz"
             if not file.exists():
                 continue
-            arrays: dict[str, Any] = dict(load_arrays(file, None))
-            seen = network_cost(theta, arrays["constraint_lidar"])
+            recording = read_recording(file)
+            seen = network_cost(theta, recording.constraint_lidar)
             replay = make_replay(
                 config.train.env,
-                Recording(**arrays),
+                recording,
                 intrinsic=seen if kind == "best" else None,
                 label=f"{algorithm_label(name)}, {COST_LABELS[kind]}",
             )
