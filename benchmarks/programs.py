@@ -5,7 +5,6 @@ What `population.py` measures beside the package's own `autocost_jax.bench`.
 
 import dataclasses
 import functools
-import itertools
 import tempfile
 import time
 from collections.abc import Sequence
@@ -23,9 +22,10 @@ from autocost_jax.bench import (
     idle,
     program_speed,
     timed,
+    update_flop,
 )
 from autocost_jax.config import Algorithm, SearchConfig, TrainConfig
-from autocost_jax.envs.env import Env, make_env
+from autocost_jax.envs.env import make_env
 from autocost_jax.population import make_agents, make_population
 
 
@@ -140,35 +140,6 @@ def update_speed(
         matmul_tera_flop_per_second=round(peak / 1e12, 4),
         share=round(flop / spent / peak, 3),
     )
-
-
-def update_flop(train: TrainConfig, algorithm: Algorithm, env: Env) -> float:
-    """Floating-point operations of the matrix products of one slot's update.
-
-    With W weights, W_0 of them in the first layer, and R rows: a forward pass is
-    2 R W, a gradient 2 R (3 W - W_0), a Fisher product 4 R W a direction.
-    """
-    agent = train.agent
-    rows = train.num_worlds * train.env.num_steps
-    hidden = (env.observation_size, *agent.hidden_sizes)
-    first = hidden[0] * hidden[1] if len(hidden) > 1 else 0
-
-    def weights(outputs: int) -> int:
-        return sum(a * b for a, b in itertools.pairwise((*hidden, outputs)))
-
-    policy, critic = weights(env.action_size), weights(1)
-
-    def gradient(count: int) -> int:
-        return 2 * rows * (3 * count - first)
-
-    total = 2 * agent.value_passes * gradient(critic)
-    if algorithm == "cpo":
-        products = agent.cg_iterations + 1
-        return total + products * 2 * 4 * rows * policy + 2 * gradient(policy)
-    total += agent.policy_passes * gradient(policy)
-    if agent.policy_minibatches > 1:  # the whole batch's KL before each pass
-        total += agent.policy_passes * 2 * rows * policy
-    return total
 
 
 def matmul_rate(width: int, devices: Sequence[Any]) -> float:

@@ -79,6 +79,7 @@ FIGURES = (
         ),
         designs=(
             "extrinsic",
+            "margin_1x",
             "margin_2x",
             "margin_3x",
             "steep",

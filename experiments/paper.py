@@ -70,6 +70,7 @@ DESIGNS: dict[str, Design] = {
     "distance_decrease": Design("distance decrease", "distance_decrease"),
     "distance_change": Design("distance change", "distance_change"),
     "distance_change_indicator": Design("its indicator", "distance_change_indicator"),
+    "margin_1x": Design("margin 1x", "safety_margin_1x"),
     "margin_2x": Design("margin 2x", "safety_margin_2x"),
     "margin_3x": Design("margin 3x", "safety_margin_3x"),
     "steep": Design("steep network", WITH_NETWORK, found="steep"),

@@ -261,12 +261,13 @@ def table(result: dict[str, Any]) -> str:
             f"| {rank['rule']} | {rank['epochs']} epochs | {seeds} | "
             f"{np.mean(rank['by_seed']):.2f} |"
         )
-    lines += [
-        "",
-        "| 432 epochs on twelve costs | distance of the choice from the aims, seed by "
-        "seed | mean |",
-        "|---|---|---|",
-    ]
+    if "ways" in result:
+        lines += [
+            "",
+            "| 432 epochs on twelve costs | distance of the choice from the aims, seed "
+            "by seed | mean |",
+            "|---|---|---|",
+        ]
     for row in result.get("ways", ()):
         seeds = ", ".join(f"{value:.2f}" for value in row["by_seed"])
         lines.append(f"| {row['way']} | {seeds} | {np.mean(row['by_seed']):.2f} |")

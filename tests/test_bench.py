@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 from autocost_jax import bench
-from autocost_jax.bench import Speed, env_speed, slot_speeds
+from autocost_jax.bench import Speed, env_speed, slot_speeds, update_flop
 from autocost_jax.cli import main
 from autocost_jax.config import EnvConfig, preset
 from autocost_jax.costs import training_cost
@@ -84,7 +84,7 @@ def test_update_speed_is_the_difference_of_two_programs(rates):
     train = dataclasses.replace(preset("paper").train, num_worlds=4)
     row = programs.update_speed(train, "cpo", 3, jax.devices()[:1])
     assert row.seconds == 6.0  # 12,000 steps at 1000 less at 2000 a second
-    flop = 3 * programs.update_flop(train, "cpo", make_env(train.env))
+    flop = 3 * update_flop(train, "cpo", make_env(train.env))
     assert row.tera_flop == round(flop / 1e12, 4)
     assert row.share == round(flop / 6.0 / 1e12, 3)
 
@@ -131,7 +131,7 @@ def test_update_flop_is_what_the_compiler_counts(algorithm):
     assert analysis is not None
     counted = analysis["flops"]
     # On top come the acting and first passes, a line search and all that is no product.
-    assert 0.6 * counted < programs.update_flop(train, algorithm, env) < counted
+    assert 0.6 * counted < update_flop(train, algorithm, env) < counted
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from autocost_jax.cli import main
+from autocost_jax.commandline import USUAL, guarded
 from autocost_jax.config import preset
 from autocost_jax.runs import limits
 from autocost_jax.runs.directory import RunDir, read_metrics
@@ -205,6 +206,24 @@ def test_the_settings_of_the_user_of_jax_hold(settings, answer):
     lines = (done.stdout + done.stderr).decode().splitlines()
     assert [answer in line for line in lines] == [True]
     assert done.returncode == (2 if "no device" in answer else 0)
+
+
+def test_commands_set_jax_back_to_what_they_need(capsys):
+    before = {name: getattr(jax.config, name) for name in USUAL}
+    odd = {"jax_debug_nans": True, "jax_numpy_rank_promotion": "raise"}
+    seen = []
+    try:
+        for name, value in odd.items():
+            jax.config.update(name, value)
+        guarded(lambda: seen.append({n: getattr(jax.config, n) for n in USUAL}), "it")
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+    assert seen == [USUAL]
+    error = capsys.readouterr().err
+    assert error.endswith(": jax_debug_nans, jax_numpy_rank_promotion\n")
+    guarded(lambda: None, "it")
+    assert capsys.readouterr().err == ""
 
 
 def test_no_command_prints_the_commands(capsys):

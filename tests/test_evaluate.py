@@ -114,3 +114,18 @@ def test_of_no_valid_episode_nothing_is_known(state, key):
     known = [name for name, value in row.items() if not np.isnan(value)]
     assert known == ["episodes"]
     assert "of no valid episode nothing is known" in score_line("broken", row)
+
+
+def test_evaluate_is_compiled_once(state, key):
+    env = make_toy_env()
+    agent, before = linear_agent(env), evaluate._cache_size()
+    first, second = (evaluate(env, agent, state, k, 2) for k in jax.random.split(key))
+    assert evaluate._cache_size() == before + 1
+    assert not np.array_equal(first.ep_return, second.ep_return)
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, None])
+def test_no_episodes_are_refused(state, key, count):
+    env = make_toy_env()
+    with pytest.raises(ValueError, match=r"^num_episodes must be an integer in \[1"):
+        evaluate(env, linear_agent(env), state, key, count)

@@ -273,7 +273,7 @@ def test_a_report_of_damaged_files_names_the_file(whole, tmp_path, name):
     shutil.copytree(out, run, ignore=ignored)
     damage, words = DAMAGES[name]
     damage(run)
-    with pytest.raises(RunDirError, match=words) as error:
+    with pytest.raises(ValueError, match=words) as error:
         load_report(run)
     assert "\n" not in str(error.value)
 
@@ -311,6 +311,36 @@ def test_killed_and_resumed_is_bit_for_bit_the_same(whole, environment, tmp_path
     assert card == (reference / "cost.json").read_text()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_a_run_within_seconds(whole, environment, tmp_path, signum):
+    """`whole` has warmed the compile cache; a checkpoint less old than 15 s is kept."""
+    out = tmp_path / "stopped"
+    process = subprocess.Popen(
+        command(out, *SMOKE, "--set", "num_stages=1000"),
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + WAIT
+    while len(list(out.glob("stage_*.npz"))) < 3:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    process.send_signal(signum)
+    _, error = process.communicate(timeout=10)
+    assert process.returncode == 128 + signum
+    assert error.splitlines()[-1].endswith(f"--resume --out {out}")
+    rows, stages = read_metrics(out), len(list_stages(out))
+    config, _ = read_config(out)
+    with RunDir.open(out) as run:
+        assert run.lost_files(stages) == []
+    assert len(rows) // config.train.num_epochs in (stages, stages + 1)
+    newest = max(int(p.name.split("_")[1]) for p in out.glob("checkpoints/step_*"))
+    assert newest == len(rows)
+
+
 def bad(capsys, *argv: str) -> str:
     """The one line that a bad command line gets."""
     return refused(main, argv, capsys)
@@ -325,6 +355,9 @@ def bad(capsys, *argv: str) -> str:
         (["--population-size", "1"], ["num_elites", "population_size=1"]),
         (["--num-worlds", "many"], ["--num-worlds", "many"]),
         (["--num-epochs", "0"], ["num_epochs"]),
+        (["--num-epochs", "1" + 25 * "0"], ["num_epochs", "2**31"]),
+        (["--cost-limit", "1e300"], ["cost_limit", "float32"]),
+        (["--set", "policy_lr=1e-300"], ["policy_lr", "float32"]),
         (["--preset", "smoke", "--num-worlds", "20000000"], ["search needs", "GB"]),
         (["--preset", "smoke", "--num-epochs", "1000000000"], ["search needs", "GB"]),
         (["--preset", "smoke", "--eval-episodes", "200000000"], ["episodes needs"]),

@@ -812,3 +812,22 @@ def test_a_failed_write_keeps_the_old_file(
         store.save_arrays(file, {"a": np.zeros(2)})
     assert os.listdir(tmp_path) == ["a.npz"]
     assert store.load_arrays(file)["a"].all()
+
+
+def test_what_cannot_be_made_again_is_named(tmp_path):
+    """Before a resumed run trains to its end, not after."""
+    with RunDir.create(tmp_path / "run", preset("smoke"), {}) as run:
+        for number in range(3):
+            run.write_stage(number, {"theta": np.zeros(3)})
+            run.log_metrics({"cost": number}, number)
+        assert run.lost_files(3) == []
+        (run.path / "stage_00.npz").unlink()
+        os.truncate(run.path / "stage_02.npz", 50)
+        with (run.path / "metrics.jsonl").open("r+b") as file:
+            file.write(b"[")
+        lines = run.lost_files(3)
+    words = ("stage_00.npz", "stage_02.npz", "line 1 is not")
+    assert len(lines) == len(words)
+    for line, word in zip(lines, words, strict=True):
+        assert word in line
+        assert "gets no report" in line

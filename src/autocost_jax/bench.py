@@ -6,6 +6,7 @@ compile, which is timed by itself and cold unless a compile cache is switched on
 
 import dataclasses
 import functools
+import itertools
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -161,6 +162,35 @@ def algorithm_speeds(
         )
         for size, devices, what in programs
     ]
+
+
+def update_flop(train: TrainConfig, algorithm: Algorithm, env: Env) -> float:
+    """Floating-point operations of the matrix products of one slot's update.
+
+    With W weights, W_0 of them in the first layer, and R rows: a forward pass is
+    2 R W, a gradient 2 R (3 W - W_0), a Fisher product 4 R W a direction.
+    """
+    agent = train.agent
+    rows = train.num_worlds * train.env.num_steps
+    hidden = (env.observation_size, *agent.hidden_sizes)
+    first = hidden[0] * hidden[1] if len(hidden) > 1 else 0
+
+    def weights(outputs: int) -> int:
+        return sum(a * b for a, b in itertools.pairwise((*hidden, outputs)))
+
+    policy, critic = weights(env.action_size), weights(1)
+
+    def gradient(count: int) -> int:
+        return 2 * rows * (3 * count - first)
+
+    total = 2 * agent.value_passes * gradient(critic)
+    if algorithm == "cpo":
+        products = agent.cg_iterations + 1
+        return total + products * 2 * 4 * rows * policy + 2 * gradient(policy)
+    total += agent.policy_passes * gradient(policy)
+    if agent.policy_minibatches > 1:  # the whole batch's KL before each pass
+        total += agent.policy_passes * 2 * rows * policy
+    return total
 
 
 def idle(agent: Agent) -> Agent:

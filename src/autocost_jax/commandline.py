@@ -5,7 +5,6 @@ import dataclasses
 import io
 import logging
 import os
-import re
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +17,14 @@ from autocost_jax.config.checks import all_fields
 T = TypeVar("T")
 C = TypeVar("C", SearchConfig, TrainConfig)
 BAD_INPUT = 2
+USUAL = {  # of JAX's settings
+    "jax_debug_nans": False,
+    "jax_debug_infs": False,
+    "jax_disable_jit": False,
+    "jax_enable_x64": False,
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_numpy_rank_promotion": "allow",
+}
 
 
 def parse(kind: type[T], argv: Sequence[str], prog: str, **options: Any) -> T:
@@ -37,12 +44,13 @@ def parse(kind: type[T], argv: Sequence[str], prog: str, **options: Any) -> T:
 
 
 def _first_sentence(panel: str) -> str:
-    """The message of tyro's error panel without its frame, on one line."""
-    lines = [re.sub(r"[│╭╮╰╯─]+", " ", line).strip() for line in panel.splitlines()]
-    text = " ".join(line for line in lines if line)
-    text = re.sub(r"^(Parsing error|Value error|Error parsing \S+:)\s+", "", text)
-    advice = r"\s+(?:Argument helptext|For full helptext|Arguments similar)"
-    return re.split(advice, text)[0]
+    """The message of tyro's error panel without its title, frame and advice."""
+    lines = [line.strip("│ ") for line in panel.splitlines()]
+    _, *message = [line for line in lines if line.strip("╭╮╰╯─- ")]
+    text = " ".join(message)
+    for advice in ("Argument helptext", "For full helptext", "Arguments similar"):
+        text = text.partition(advice)[0]
+    return text.strip()
 
 
 def with_flags(options: type, config: type, names: Sequence[str]) -> Any:
@@ -124,6 +132,7 @@ def guarded(main: Callable[[], None], prog: str) -> None:
     from autocost_jax.runs.cluster import is_lost_peer
     from autocost_jax.runs.stopping import Stopped
 
+    settle_jax()
     try:
         _with_devices(main)
     except ValueError as error:
@@ -138,6 +147,22 @@ def guarded(main: Callable[[], None], prog: str) -> None:
         fail(f"{prog}: {words} {path}", status=128 + stop.signum)
     except KeyboardInterrupt:
         fail(f"{prog}: interrupted; a run goes on with --resume", status=130)
+
+
+def settle_jax() -> None:
+    """Take back what the environment has set of JAX and would break a command.
+
+    NaN and infinity are values here: a slot that meets one is frozen and counted.
+    """
+    import jax
+
+    changed = [
+        name for name, value in USUAL.items() if getattr(jax.config, name) != value
+    ]
+    for name in changed:
+        jax.config.update(name, USUAL[name])
+    if changed:
+        sys.stderr.write(f"set back to what commands need: {', '.join(changed)}\n")
 
 
 def _with_devices(main: Callable[[], None]) -> None:

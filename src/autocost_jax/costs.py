@@ -195,7 +195,7 @@ def parse_cost(
     A configuration is read and checked with it before a run's processes meet.
     Arguments and errors are those of `training_cost`.
     """
-    if isinstance(limit, float | int):
+    if not isinstance(limit, jax.Array):
         require(FINITE.holds(limit), "limit", FINITE.allowed, limit)
     names = [term.name for term in bank]
     weights = np.zeros(len(bank), np.float32)

@@ -1,5 +1,6 @@
 """Whole episodes of a fixed policy on fresh layouts."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 from flax import struct
 
 from autocost_jax.agents.base import Agent
+from autocost_jax.config.checks import COUNT, require
 from autocost_jax.envs.env import Env
 from autocost_jax.metrics import mean_of
 from autocost_jax.records import CostInputs, EnvState, EvalResult, Key, Layout
@@ -84,7 +86,11 @@ def run_episodes(
       deterministic: act by the mean instead of sampling.
       watch: worlds [E, ...] -> what else to keep of them, such as the poses that a
         replay is made of.
+
+    Raises:
+      ValueError: no episode is asked for.
     """
+    require(COUNT.holds(num_episodes), "num_episodes", COUNT.allowed, num_episodes)
     key_reset, key_act = jax.random.split(key)
     start = reset_worlds(env, key_reset, num_episodes)
 
@@ -146,6 +152,9 @@ def score(episodes: Episodes) -> EvalResult:
     )
 
 
+@functools.partial(
+    jax.jit, static_argnames=("env", "agent", "num_episodes", "deterministic")
+)
 def evaluate(
     env: Env,
     agent: Agent,
@@ -156,7 +165,8 @@ def evaluate(
 ) -> EvalResult:
     """Scores of a fixed policy over whole episodes of fresh layouts.
 
-    Arguments as in `run_episodes`.
+    It is compiled at the first call with an environment, an agent and a number of
+    episodes, and kept for other states and keys. Arguments as in `run_episodes`.
 
     Returns:
       EvalResult, fields [E].

@@ -223,7 +223,11 @@ def load_arrays(
       RunDirError: if the file is unreadable, pickled, or not as `spec` says.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened here: of a broken file numpy would leave it open.
+        with (
+            Path(path).open("rb") as file,
+            np.load(file, allow_pickle=False) as archive,
+        ):
             arrays = {name: archive[name] for name in archive.files}
     except Exception as error:  # numpy and zipfile raise a dozen kinds on bad bytes
         reason = (str(error) or type(error).__name__).splitlines()[0]

@@ -3,7 +3,7 @@
 The chunk is K epochs of the whole population under `jax.shard_map`: each device holds
 its share of every group and trains it without talking to the others. Groups are padded
 with copies of their first slot to a multiple of the device count. One code path serves
-one device and many. Programs are compiled here and in `bench` alone.
+one device and many. Programs are compiled here, in `evaluate` and in `bench` alone.
 """
 
 import functools

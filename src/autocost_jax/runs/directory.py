@@ -172,8 +172,8 @@ class RunDir:
                 "resume with the run's own configuration, or start a new run"
             )
         run = cls(path, config, facts, lock_directory(path), config_hash(recorded))
-        for folder in (path, path / "checkpoints", path / "policies"):
-            remove_temporaries(folder)
+        for folder in ("", "checkpoints", "policies", "report", "replays"):
+            remove_temporaries(path / folder)
         changed = changed_facts(facts, run_facts())
         if changed:
             run.warnings.append(
@@ -295,6 +295,24 @@ class RunDir:
         if checkpoint is not None and warning is not None:
             checkpoint.warnings.append(warning)
         return checkpoint
+
+    def lost_files(self, num_stages: int) -> list[str]:
+        """What of a resumed run is broken and cannot be made again, in words.
+
+        Args:
+          num_stages: stages that have left their file.
+        """
+        lost = []
+        for number in range(num_stages):
+            try:
+                load_arrays(self.path / f"stage_{number:02d}.npz")
+            except RunDirError as error:
+                lost.append(f"{error}: the run goes on, but gets no report")
+        try:
+            read_metrics(self.path)
+        except RunDirError as error:
+            lost.append(f"{error}: the run goes on, but gets no report")
+        return lost
 
     def truncate_metrics(self, metrics_bytes: int) -> str | None:
         """Cut metrics.jsonl to a length; returns a warning if it was shorter."""

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TextIO
 import jax
 import numpy as np
 
+from autocost_jax.population import Population
 from autocost_jax.runs import cluster
 from autocost_jax.runs.directory import RunDir, check_free_space, estimate_bytes
 from autocost_jax.runs.progress import Display
@@ -86,6 +87,16 @@ def start(
         if hint:
             display.say(hint)
     return (state if found is None else found), found is not None
+
+
+def compile_ahead(
+    population: Population, training: Any, slots: Any, display: Display
+) -> None:
+    """Compile the program of a run before its first chunk, and say so meanwhile."""
+    begun = time.monotonic()
+    with display.working("compiling the population program"):
+        population.compile(training, slots)
+    display.say(f"compiled in {time.monotonic() - begun:.1f} s")
 
 
 def keep_chunks(

@@ -1,6 +1,5 @@
 """One search in a run directory: watched, checkpointed, resumed, reported."""
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from autocost_jax.runs.limits import (
 )
 from autocost_jax.runs.loop import (
     Chunk,
+    compile_ahead,
     keep_chunks,
     metric_rows,
     output,
@@ -158,8 +158,12 @@ def run_search(
             display.say(f"resuming {path} after {done}")
             display.skip(_steps_done(config, state))
             require_survivors(config, state.es)  # before anything is compiled
+            num_stages = min(int(state.stage), config.num_stages)
+            for line in run.lost_files(num_stages) if run else ():
+                display.say(line)
         if int(state.stage) < config.total_stages:
-            _compile(searcher, state, display)
+            slots = slots_of(searcher, state)
+            compile_ahead(searcher.population, state.training, slots, display)
         chunks = _chunks(run, searcher, state, display)
         state = keep_chunks(run, chunks, state, searcher.population.fetch)
         if run is not None:
@@ -167,14 +171,6 @@ def run_search(
             page = write_report(path) if write_report else path
             display.say(f"done in {format_seconds(display.elapsed)}; open {page}")
         cluster.wait_for_all()
-
-
-def _compile(searcher: Searcher, state: SearchState, display: Display) -> None:
-    start = time.monotonic()
-    slots = slots_of(searcher, state)
-    with display.working("compiling the population program"):
-        searcher.population.compile(state.training, slots)
-    display.say(f"compiled in {time.monotonic() - start:.1f} s")
 
 
 def _steps_done(config: SearchConfig, state: SearchState) -> int:

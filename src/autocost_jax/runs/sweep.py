@@ -19,6 +19,14 @@ from flax import struct
 
 from autocost_jax.agents.base import actor
 from autocost_jax.config import Algorithm, AlgorithmName, TrainConfig
+from autocost_jax.config.checks import (
+    FINITE,
+    SEED,
+    is_finite,
+    is_tuple_of,
+    one_of,
+    require,
+)
 from autocost_jax.costs import parse_cost, training_cost
 from autocost_jax.envs.env import Env, make_env
 from autocost_jax.files import flatten
@@ -39,6 +47,7 @@ from autocost_jax.runs.limits import (
 )
 from autocost_jax.runs.loop import (
     Chunk,
+    compile_ahead,
     keep_chunks,
     metric_rows,
     output,
@@ -56,6 +65,7 @@ from autocost_jax.runs.progress import Display, format_seconds
 from autocost_jax.train import EpochState
 
 GROUPS: tuple[Algorithm, ...] = get_args(Algorithm)
+FILE_NAME = r"[^./\\\0-\x1f][^/\\\0-\x1f]{0,99}"
 
 
 @dataclass(frozen=True)
@@ -77,14 +87,17 @@ class Method:
     theta: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[^./\\\0-\x1f][^/\\\0-\x1f]{0,99}", self.label):
-            raise ValueError(
-                "label must be the name of a file, of at most 100 characters and not "
-                f"with a dot first, got {self.label!r}"
-            )
-        if self.algorithm not in ("ppo", *GROUPS):
-            names = ", ".join(("ppo", *GROUPS))
-            raise ValueError(f"algorithm must be of {names}, got {self.algorithm!r}")
+        is_name = isinstance(self.label, str) and re.fullmatch(FILE_NAME, self.label)
+        allowed = (
+            "the name of a file, of at most 100 characters and not with a dot first"
+        )
+        require(bool(is_name), "label", allowed, self.label)
+        names = one_of(AlgorithmName)
+        require(names.holds(self.algorithm), "algorithm", names.allowed, self.algorithm)
+        require(isinstance(self.cost, str), "cost", "terms of the bank", self.cost)
+        require(FINITE.holds(self.limit), "limit", FINITE.allowed, self.limit)
+        is_theta = self.theta is None or is_tuple_of(is_finite, self.theta)
+        require(is_theta, "theta", "null or a tuple of finite numbers", self.theta)
         theta = None if self.theta is None else np.asarray(self.theta)
         parse_cost(self.cost, theta, self.limit)
 
@@ -109,8 +122,12 @@ class SweepConfig:
     seeds: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        labels = [method.label for method in self.methods]
-        if not labels or len(set(labels)) < len(labels):
+        kind, rows = TrainConfig, self.methods
+        require(isinstance(self.train, kind), "train", "a TrainConfig", self.train)
+        is_table = rows != () and is_tuple_of(lambda row: isinstance(row, Method), rows)
+        require(is_table, "methods", "a tuple of Methods, one at least", rows)
+        labels = [method.label for method in rows]
+        if len(set(labels)) < len(labels):
             raise ValueError(f"methods must have distinct labels, got {labels}")
         sizes = {len(row.theta) for row in self.methods if row.theta is not None}
         if len(sizes) > 1:
@@ -118,8 +135,10 @@ class SweepConfig:
                 "the methods of a table must have cost networks of one size, "
                 f"got {sorted(sizes)} parameters"
             )
-        if not self.seeds or len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"seeds must be distinct numbers, got {self.seeds}")
+        is_seeds = self.seeds != () and is_tuple_of(SEED.holds, self.seeds)
+        allowed = "a tuple of distinct integers in [0, 2**32)"
+        is_distinct = is_seeds and len(set(self.seeds)) == len(self.seeds)
+        require(is_distinct, "seeds", allowed, self.seeds)
 
     def group(self, name: str) -> list[tuple[Method, int]]:
         """The slots of one algorithm group, in order."""
@@ -227,6 +246,8 @@ def run_sweep(
         state, resumed = start(run, path, state, display, resume)
         if resumed:
             display.say(f"resuming {path} after {int(state.epoch)} epochs")
+        if int(state.epoch) < config.train.num_epochs:
+            compile_ahead(population, state.training, slots, display)
         chunks = _chunks(config, population, slots, state, display)
         state = keep_chunks(run, chunks, state, population.fetch)
         table = []
@@ -302,10 +323,13 @@ def _finish(
             table.append(row)
             if frozen >= 0:
                 display.say(f"{stem} met a non-finite number in epoch {frozen}")
-    display.say(f"evaluating {len(files)} policies over {num_episodes} episodes ...")
     agent, states = load_policies(env, config.train, files)
     key = root_key(EVALUATION)
-    results, _ = make_evaluator(env, agent, num_episodes)(states, key)
+    with display.working(
+        f"evaluating {len(files)} policies over {num_episodes} episodes"
+    ):
+        evaluator = make_evaluator(env, agent, num_episodes)
+        results, _ = jax.block_until_ready(evaluator(states, key))
     for row, scores in zip(table, eval_summaries(results), strict=True):
         row |= scores
     run.write_json("evaluation", {"episodes": num_episodes, "rows": table})
