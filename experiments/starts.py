@@ -41,8 +41,8 @@ from autocost_jax.search.success import is_success, shortfall
 SEEDS = (0, 1, 2)
 ALGORITHMS = ("ppo_lagrangian", "cpo")
 METRICS = ("ep_return", "violating_worlds", "ep_cost")
-REACHES = (45.0, 55.0, 65.0, 75.0)  # percentiles at which a cost begins
-LOUDNESS = (0.1, 0.25, 0.6)  # at the 85th percentile
+REACHES = (50.0, 57.0, 64.0, 71.0)  # percentiles at which a cost begins
+LOUDNESS = (0.12, 0.25, 0.5)  # at the 85th percentile
 GRID = tuple(itertools.product(REACHES, LOUDNESS))
 PLAIN = ("extrinsic", "margin 3x")  # stand before the grid's costs
 STAGES = (24, 36, 48)  # lengths of a stage that are compared

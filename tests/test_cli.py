@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 
 import jax
 import numpy as np
@@ -224,6 +225,13 @@ def test_commands_set_jax_back_to_what_they_need(capsys):
     assert error.endswith(": jax_debug_nans, jax_numpy_rank_promotion\n")
     guarded(lambda: None, "it")
     assert capsys.readouterr().err == ""
+
+
+def test_the_search_is_a_command_like_any_other(capsys):
+    error = refused(main, ["evolve", "--num-epochs", "0"], capsys)
+    assert error.startswith("python -m autocost_jax.evolve: num_epochs must be")
+    main(["--version"])
+    assert capsys.readouterr().out == f"autocost {version('autocost-jax')}\n"
 
 
 def test_no_command_prints_the_commands(capsys):

@@ -282,6 +282,11 @@ BAD_FILES = {
 }
 
 
+def test_a_cost_that_is_nowhere_is_answered_with_those_there_are():
+    with pytest.raises(ValueError, match=r"nosuch\.npz: no such file.*lidar_mlp"):
+        load_cost("nosuch")
+
+
 @pytest.mark.parametrize("name", BAD_FILES)
 def test_a_bad_file_is_refused_in_one_line(tmp_path, name):
     path = tmp_path / "cost.npz"

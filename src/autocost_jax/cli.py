@@ -1,5 +1,6 @@
-"""`autocost`: demo, train, evaluate, render, report, envs, bench, info."""
+"""`autocost`: evolve, demo, train, evaluate, render, report, envs, bench, info."""
 
+import importlib.metadata
 import json
 import sys
 from collections.abc import Sequence
@@ -18,11 +19,13 @@ from autocost_jax.commandline import (
     with_flags,
 )
 from autocost_jax.config import AlgorithmName, TrainConfig
+from autocost_jax.evolve.__main__ import main as evolve
 from autocost_jax.showing import demo, envs, render, report, run_config
 
 HELP = """usage: autocost COMMAND [flags]
 
 commands:
+  evolve    search a cost: the same as `python -m autocost_jax.evolve`
   demo      two shipped policies side by side in one page; no training
   train     train agents with any cost of the bank, several seeds at once
   evaluate  score the saved policies of a run over fresh episodes
@@ -32,8 +35,7 @@ commands:
   bench     how fast worlds step and agents learn on this machine
   info      versions, devices, environments, presets; or a run directory's facts
 
-`autocost COMMAND --help` lists the flags; the search itself is
-`python -m autocost_jax.evolve`.
+`autocost COMMAND --help` lists the flags; `autocost --version` says which version.
 """
 
 
@@ -51,8 +53,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not argv or argv[0] in ("-h", "--help"):
         print(HELP, end="")
         raise SystemExit(0 if argv else BAD_INPUT)
+    if argv[0] == "--version":
+        print(f"autocost {importlib.metadata.version('autocost-jax')}")
+        return
+    if argv[0] == "evolve":
+        evolve(argv[1:])
+        return
     if argv[0] not in commands:
-        known = ", ".join(commands)
+        known = ", ".join(["evolve", *commands])
         sys.stderr.write(f"autocost: unknown command {argv[0]!r}; commands: {known}\n")
         raise SystemExit(BAD_INPUT)
     guarded(lambda: commands[argv[0]](argv[1:]), f"autocost {argv[0]}")

@@ -260,6 +260,9 @@ def load_cost(path: str | Path) -> jax.Array:
       ValueError: if the file is missing or is not a cost: one line naming it.
     """
     file = _cost_file(path)
+    if not file.exists():
+        known = ", ".join(list_costs())
+        raise ValueError(f"{file}: no such file, and no cost of the package ({known})")
     theta = np.asarray(load_arrays(file).get("theta", ()))
     _check_theta(file, theta)
     return jnp.asarray(theta, jnp.float32)
