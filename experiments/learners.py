@@ -53,7 +53,7 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     # Of `laptop` and `search`, which have 3 passes of the critics beside.
     "and a multiplier from 1, a KL bound of 0.03, CPO's violation x 1.6": (8, 1, WIDE),
 }
-OTHERS = "the same with a PID multiplier, and FOCOPS in place of CPO"
+OTHERS = "the presets' learner, but a PID multiplier, and FOCOPS for CPO"
 SETTINGS[OTHERS] = (8, 1, WIDE)
 ALGORITHMS: tuple[AlgorithmName, ...] = ("ppo_lagrangian", "cpo")
 OTHER_ALGORITHMS: tuple[AlgorithmName, ...] = ("pid_lagrangian", "focops")

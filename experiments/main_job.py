@@ -142,7 +142,7 @@ def validate(options: Options) -> None:
 
 def validation_dir(options: Options) -> Path:
     """Where the best costs are trained again."""
-    return options.runs / f"validation_{group_of(options)}"
+    return options.runs / ("validation" + "_untuned" * (group_of(options) != "tuned"))
 
 
 def validation_rows(papers: list[Path], path: Path) -> list[dict[str, Any]]:

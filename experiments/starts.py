@@ -15,8 +15,8 @@ other two seeds are from a search's aims at the end. Its last rule gives each co
 seed of its own, drawn anew 200 times; the reference is of one more.
 
 The third compares ways to spend the same number of epochs on twelve costs: all of them
-for 36, or successive halving, which drops the worse half twice and trains the rest for
-longer. What counts is the truth of the cost that a way comes out with.
+for 36, or successive halving, which drops the worst once or twice and trains the rest
+for longer. What counts is the truth of the cost that a way comes out with.
 """
 
 import dataclasses
@@ -223,7 +223,8 @@ def summarise(values: dict[str, np.ndarray]) -> dict[str, Any]:
     ]
     ranks = rank_correlations(values)
     found = {"epochs": end, "rows": rows, "rank_correlations": ranks}
-    return found | ({"ways": ways(values)} if end > 72 else {})
+    longest = max(end for way in WAYS.values() for _, end in way)
+    return found | ({"ways": ways(values)} if end >= longest else {})
 
 
 def table(result: dict[str, Any]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from autocost_jax.cli import main
-from autocost_jax.commandline import USUAL, guarded
+from autocost_jax.commandline import NEEDED, guarded
 from autocost_jax.config import preset
 from autocost_jax.runs import limits
 from autocost_jax.runs.directory import RunDir, read_metrics
@@ -210,17 +210,17 @@ def test_the_settings_of_the_user_of_jax_hold(settings, answer):
 
 
 def test_commands_set_jax_back_to_what_they_need(capsys):
-    before = {name: getattr(jax.config, name) for name in USUAL}
+    before = {name: getattr(jax.config, name) for name in NEEDED}
     odd = {"jax_debug_nans": True, "jax_numpy_rank_promotion": "raise"}
     seen = []
     try:
         for name, value in odd.items():
             jax.config.update(name, value)
-        guarded(lambda: seen.append({n: getattr(jax.config, n) for n in USUAL}), "it")
+        guarded(lambda: seen.append({n: getattr(jax.config, n) for n in NEEDED}), "it")
     finally:
         for name, value in before.items():
             jax.config.update(name, value)
-    assert seen == [USUAL]
+    assert seen == [NEEDED]
     error = capsys.readouterr().err
     assert error.endswith(": jax_debug_nans, jax_numpy_rank_promotion\n")
     guarded(lambda: None, "it")
@@ -229,7 +229,7 @@ def test_commands_set_jax_back_to_what_they_need(capsys):
 
 def test_the_search_is_a_command_like_any_other(capsys):
     error = refused(main, ["evolve", "--num-epochs", "0"], capsys)
-    assert error.startswith("python -m autocost_jax.evolve: num_epochs must be")
+    assert error.startswith("autocost evolve: num_epochs must be")
     main(["--version"])
     assert capsys.readouterr().out == f"autocost {version('autocost-jax')}\n"
 

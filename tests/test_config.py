@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ BAD = {
         "robot": ("Submarine",),
         "physics": ("exact",),
         **dict.fromkeys(("num_steps", "frameskip_binom_n", "lidar_num_bins"), COUNT),
-        **dict.fromkeys(("hazards_num", "pillars_num", "vases_num"), NUMBER),
+        **dict.fromkeys(("hazards_num", "pillars_num", "vases_num"), (*NUMBER, 1001)),
         **dict.fromkeys(
             (
                 "goal_size",
@@ -171,7 +172,9 @@ def test_bad_values_are_refused_by_name():
 
 
 def test_a_config_within_another_is_of_its_class():
-    nested = ((TrainConfig, "env"), (TrainConfig, "agent"), (SearchConfig, "train"))
+    nested: Any = (
+        (TrainConfig, "env"), (TrainConfig, "agent"), (SearchConfig, "train"),
+    )  # fmt: skip
     for kind, name in nested:
         for value in (None, {}, AgentConfig):
             with pytest.raises(ValueError, match=f"^{name} must be of "):

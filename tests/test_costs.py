@@ -177,9 +177,14 @@ def test_an_unknown_term_is_answered_with_the_bank(method):
     assert all(name in str(caught.value) for name in TERMS)
 
 
+def test_the_sum_of_weights_is_a_finite_number_too():
+    with pytest.raises(ValueError, match="the sum of weight"):
+        training_cost("3e38*extrinsic+3e38*extrinsic")
+
+
 @pytest.mark.parametrize("weight", ["x", "nan", "1e999", "-inf", "1e39", "1e-46"])
 def test_a_weight_is_a_finite_number(weight):
-    with pytest.raises(ValueError, match="must be finite in float32"):
+    with pytest.raises(ValueError, match="must be a number that float32 can hold"):
         training_cost(f"{weight}*extrinsic")
 
 

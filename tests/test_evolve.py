@@ -240,6 +240,14 @@ DAMAGES = {
         _edit_row(lambda row: row.update({"cpo/ep_cost": [0.0]})),
         "bad cpo/ep_cost",
     ),
+    "no references": (
+        _edit_arrays("stage_00.npz", lambda a: a.pop("references/ep_cost")),
+        "stage_00.npz is not the file of a stage",
+    ),
+    "text for numbers": (
+        _edit_row(lambda row: row.update({"cpo/ep_cost": ["a"] * 6})),
+        "bad cpo/ep_cost",
+    ),
     "a stage lost": (lambda run: (run / "stage_00.npz").unlink(), "stage_00.npz is mi"),
     "a stage cut": (
         lambda run: os.truncate(run / "stage_01.npz", 900),
@@ -335,7 +343,7 @@ def test_a_signal_stops_a_run_within_seconds(whole, environment, tmp_path, signu
     rows, stages = read_metrics(out), len(list_stages(out))
     config, _ = read_config(out)
     with RunDir.open(out) as run:
-        assert run.lost_files(stages) == []
+        assert run.damages(stages) == []
     assert len(rows) // config.train.num_epochs in (stages, stages + 1)
     newest = max(int(p.name.split("_")[1]) for p in out.glob("checkpoints/step_*"))
     assert newest == len(rows)

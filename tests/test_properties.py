@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from autocost_jax.config import AgentConfig, EnvConfig, SearchConfig, TrainConfig
 from autocost_jax.config.checks import all_fields
-from autocost_jax.costs import load_cost, parse_cost
+from autocost_jax.costs import BANK, load_cost, parse_cost
 from autocost_jax.evolve.__main__ import main
 from autocost_jax.runs.config_files import config_hash, from_dict, to_dict
 from autocost_jax.runs.sweep import Method, SweepConfig
@@ -57,12 +57,12 @@ def constructor_calls(draw: st.DrawFn) -> tuple[type, dict[str, Any]]:
     kind = draw(st.sampled_from(KINDS))
     names = [field.name for field in dataclasses.fields(kind)]
     chosen = draw(st.lists(st.sampled_from(names), min_size=1, max_size=3))
-    given = {name: draw(values) for name in chosen}
+    fields = {name: draw(values) for name in chosen}
     if kind is Method:
-        given.setdefault("label", "a row")
+        fields.setdefault("label", "a row")
     if kind is SweepConfig:
-        given.setdefault("methods", (Method("a row"),))
-    return kind, given
+        fields.setdefault("methods", (Method("a row"),))
+    return kind, fields
 
 
 def answer(function: Callable[..., Any], *args: Any, **named: Any) -> tuple[Any, Any]:
@@ -73,9 +73,9 @@ def answer(function: Callable[..., Any], *args: Any, **named: Any) -> tuple[Any,
         return None, str(error)
 
 
-def is_stored_or_refused(kind: type, given: dict[str, Any]) -> None:
+def is_stored_or_refused(kind: type, fields: dict[str, Any]) -> None:
     """What is accepted comes back equal from YAML; the rest gets one line."""
-    config, refusal = answer(kind, **given)
+    config, refusal = answer(kind, **fields)
     if refusal is not None:
         assert "\n" not in refusal
         return
@@ -164,8 +164,17 @@ def test_ten_thousand_command_lines_are_planned_or_refused(argv):
     is_planned_or_refused(argv)
 
 
+terms = st.tuples(
+    st.one_of(
+        st.just(""), st.floats(0.01, 5.0).map(lambda x: f"{x}*"), st.text("*-3e8")
+    ),
+    st.one_of(st.sampled_from([term.name for term in BANK]), st.text(max_size=4)),
+).map("".join)
+theta_of_cost = st.one_of(st.none(), st.just((0.5,) * 41), values)
+
+
 @FEW
-@given(st.text(max_size=40), st.one_of(st.none(), values), plain)
+@given(st.lists(terms, max_size=3).map("+".join), theta_of_cost, plain)
 def test_a_training_cost_is_understood_or_refused(method, theta, limit):
     parsed, refusal = answer(parse_cost, method, theta, limit)
     if refusal is None:

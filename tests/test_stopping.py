@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import pytest
 from flax import struct
 
 from autocost_jax.commandline import guarded
+from autocost_jax.runs import stopping
 from autocost_jax.runs.loop import Chunk, keep_chunks
 from autocost_jax.runs.stopping import SIGNALS, Stopped, noted_signals
 
@@ -44,6 +46,10 @@ def chunks(signum, at, count=5):
         yield Chunk(State(jnp.float32(i)), 2 * i, [{}, {}], {"epoch": 2 * i + 2}, False)
 
 
+def train(run, chunks):
+    return keep_chunks(run, Run.path, chunks, State(jnp.float32(-1)), lambda x: x)
+
+
 def handlers():
     return [signal.getsignal(signum) for signum in SIGNALS]
 
@@ -52,7 +58,7 @@ def handlers():
 def test_the_epochs_at_hand_end_whole_and_are_kept(signum, capfd):
     run, before = Run(), handlers()
     with pytest.raises(Stopped) as stop:
-        keep_chunks(run, chunks(signum, at=3), State(jnp.float32(-1)), lambda x: x)
+        train(run, chunks(signum, at=3))
     assert (stop.value.signum, stop.value.path) == (signum, run.path)
     assert isinstance(stop.value, KeyboardInterrupt)  # `except Exception` lets it pass
     assert run.rows == list(range(8))
@@ -63,7 +69,7 @@ def test_the_epochs_at_hand_end_whole_and_are_kept(signum, capfd):
 
 def test_without_a_signal_all_chunks_are_taken():
     run, before = Run(), handlers()
-    end = keep_chunks(run, chunks(0, at=9), State(jnp.float32(-1)), lambda x: x)
+    end = train(run, chunks(0, at=9))
     assert float(end.training) == 4.0
     assert run.rows == list(range(10))
     assert handlers() == before
@@ -84,19 +90,55 @@ def test_only_the_main_thread_notes_signals():
     assert handlers() == before
 
 
-def test_a_second_signal_ends_the_program_at_once():
-    program = (
-        "import signal\n"
-        "from autocost_jax.runs.stopping import noted_signals\n"
-        "with noted_signals():\n"
-        "    for _ in range(2):\n"
-        "        signal.raise_signal(signal.SIGTERM)\n"
-        "    print('still there')\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True)
-    assert done.returncode == -signal.SIGTERM
-    assert done.stdout == b""
-    assert done.stderr.count(b"once more") == 1
+def test_a_process_without_a_directory_stops_as_well():
+    with pytest.raises(Stopped):
+        train(None, chunks(signal.SIGTERM, at=4))  # the last one
+
+
+def test_what_was_ignored_stays_ignored():
+    """As under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        end = train(Run(), chunks(signal.SIGHUP, at=1))
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert float(end.training) == 4.0
+
+
+BUSY = """
+import hashlib, sys
+sys.path.append(sys.argv[1])  # the module alone, without all of JAX
+import stopping
+stopping.ECHO = float(sys.argv[2])
+with stopping.noted_signals():
+    print("ready", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # like a compiled program
+"""
+
+
+@pytest.mark.parametrize(
+    ("echo", "status"), [("0", 128 + signal.SIGTERM), ("60", None)]
+)
+def test_a_second_signal_ends_a_busy_program_at_once(echo, status):
+    """An echo of the first does not."""
+    folder = str(Path(stopping.__file__).parent)
+    words = [sys.executable, "-c", BUSY, folder, echo]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == b"ready\n"
+        process.send_signal(signal.SIGTERM)
+        assert b"once more" in process.stderr.readline() + process.stderr.readline()
+        time.sleep(0.1)
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(timeout=3)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            assert status is None
+        else:
+            assert process.returncode == status
 
 
 def test_the_command_line_says_how_to_go_on(capsys):

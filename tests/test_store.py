@@ -820,14 +820,13 @@ def test_what_cannot_be_made_again_is_named(tmp_path):
         for number in range(3):
             run.write_stage(number, {"theta": np.zeros(3)})
             run.log_metrics({"cost": number}, number)
-        assert run.lost_files(3) == []
+        assert run.damages(3) == []
         (run.path / "stage_00.npz").unlink()
         os.truncate(run.path / "stage_02.npz", 50)
         with (run.path / "metrics.jsonl").open("r+b") as file:
             file.write(b"[")
-        lines = run.lost_files(3)
+        lines = run.damages(3)
     words = ("stage_00.npz", "stage_02.npz", "line 1 is not")
     assert len(lines) == len(words)
     for line, word in zip(lines, words, strict=True):
         assert word in line
-        assert "gets no report" in line

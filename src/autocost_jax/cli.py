@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"autocost {importlib.metadata.version('autocost-jax')}")
         return
     if argv[0] == "evolve":
-        evolve(argv[1:])
+        evolve(argv[1:], "autocost evolve")
         return
     if argv[0] not in commands:
         known = ", ".join(["evolve", *commands])

@@ -17,7 +17,7 @@ from autocost_jax.config.checks import all_fields
 T = TypeVar("T")
 C = TypeVar("C", SearchConfig, TrainConfig)
 BAD_INPUT = 2
-USUAL = {  # of JAX's settings
+NEEDED = {  # of JAX's settings
     "jax_debug_nans": False,
     "jax_debug_infs": False,
     "jax_disable_jit": False,
@@ -38,16 +38,16 @@ def parse(kind: type[T], argv: Sequence[str], prog: str, **options: Any) -> T:
             return tyro.cli(kind, args=list(argv), prog=prog, config=(none,), **options)
     except SystemExit as stop:
         if stop.code not in (0, None):
-            fail(f"{prog}: {_first_sentence(panel.getvalue())} (see {prog} --help)")
+            fail(f"{prog}: {_message(panel.getvalue())} (see {prog} --help)")
         sys.stderr.write(panel.getvalue())
         raise
 
 
-def _first_sentence(panel: str) -> str:
+def _message(panel: str) -> str:
     """The message of tyro's error panel without its title, frame and advice."""
     lines = [line.strip("│ ") for line in panel.splitlines()]
-    _, *message = [line for line in lines if line.strip("╭╮╰╯─- ")]
-    text = " ".join(message)
+    lines = [line for line in lines if line.strip("╭╮╰╯─- ")]
+    text = " ".join(lines[1:])
     for advice in ("Argument helptext", "For full helptext", "Arguments similar"):
         text = text.partition(advice)[0]
     return text.strip()
@@ -118,7 +118,8 @@ def fail(message: str, status: int = BAD_INPUT) -> None:
     """End the program with one line on stderr."""
     from autocost_jax.runs.cluster import leave
 
-    sys.stderr.write(" ".join(message.split()) + "\n")
+    with contextlib.suppress(OSError):  # a closed terminal
+        sys.stderr.write(" ".join(map(str.strip, message.splitlines())) + "\n")
     leave(status)
     raise SystemExit(status)
 
@@ -126,13 +127,14 @@ def fail(message: str, status: int = BAD_INPUT) -> None:
 def guarded(main: Callable[[], None], prog: str) -> None:
     """Run a command; expected errors become one line and an exit status.
 
-    Bad input is status 2, a run that could not go on is 1, Ctrl-C is 130, SIGTERM 143.
+    Bad input is status 2, a run that could not go on is 1, a signal N is 128 + N: 130
+    for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP.
     """
     from autocost_jax.files import DiskFullError
     from autocost_jax.runs.cluster import is_lost_peer
     from autocost_jax.runs.stopping import Stopped
 
-    settle_jax()
+    settle_jax(prog)
     try:
         _with_devices(main)
     except ValueError as error:
@@ -149,7 +151,7 @@ def guarded(main: Callable[[], None], prog: str) -> None:
         fail(f"{prog}: interrupted; a run goes on with --resume", status=130)
 
 
-def settle_jax() -> None:
+def settle_jax(prog: str) -> None:
     """Take back what the environment has set of JAX and would break a command.
 
     NaN and infinity are values here: a slot that meets one is frozen and counted.
@@ -157,12 +159,13 @@ def settle_jax() -> None:
     import jax
 
     changed = [
-        name for name, value in USUAL.items() if getattr(jax.config, name) != value
+        name for name, value in NEEDED.items() if getattr(jax.config, name) != value
     ]
     for name in changed:
-        jax.config.update(name, USUAL[name])
+        jax.config.update(name, NEEDED[name])
     if changed:
-        sys.stderr.write(f"set back to what commands need: {', '.join(changed)}\n")
+        names = ", ".join(changed)
+        sys.stderr.write(f"{prog}: set back to what commands need: {names}\n")
 
 
 def _with_devices(main: Callable[[], None]) -> None:

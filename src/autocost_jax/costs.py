@@ -7,6 +7,7 @@ with different costs differ in data only and share one program. A user adds a te
 passing a longer bank.
 """
 
+import contextlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
@@ -206,13 +207,15 @@ def parse_cost(
                 f"unknown cost term {name.strip()!r} in method {method!r}; "
                 f"terms: {', '.join(names)}"
             )
-        try:
+        weight: Any = factor
+        with contextlib.suppress(ValueError):
             weight = float(factor) if factor else 1.0
-        except ValueError:
-            weight = None  # no number
         what = f"weight {factor!r} in method {method!r}"
         require(FINITE.holds(weight), what, FINITE.allowed, weight)
-        weights[names.index(name.strip())] += weight
+        at = names.index(name.strip())
+        total = float(weights[at]) + weight
+        require(FINITE.holds(total), f"the sum of {what}", FINITE.allowed, total)
+        weights[at] = total
     if theta is None:
         uses_network = "intrinsic" in names and weights[names.index("intrinsic")] != 0
         if uses_network:

@@ -165,8 +165,9 @@ def evaluate(
 ) -> EvalResult:
     """Scores of a fixed policy over whole episodes of fresh layouts.
 
-    It is compiled at the first call with an environment, an agent and a number of
-    episodes, and kept for other states and keys. Arguments as in `run_episodes`.
+    It is compiled at the first call with an environment and an agent, each made once,
+    and a number of episodes, and kept for other states and keys. Arguments as in
+    `run_episodes`.
 
     Returns:
       EvalResult, fields [E].

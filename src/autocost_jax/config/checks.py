@@ -26,14 +26,18 @@ class Check(NamedTuple):
 
 def is_finite(value: Any) -> bool:
     """Whether a value is a number that is finite, and not lost, in float32."""
-    is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    return is_number and (value == 0 or LEAST <= abs(value) <= MOST)
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return False
+    size: Any = abs(value)
+    return bool(size == 0 or LEAST <= size <= MOST)
 
 
 def is_integer(value: Any, bound: int = 2**31) -> bool:
     """Whether a value is an integer, which a bool is not, of a size below a bound."""
-    is_number = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    return is_number and abs(value) < bound
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        return False
+    size: Any = abs(value)
+    return bool(size < bound)
 
 
 def is_tuple_of(holds: Callable[[Any], bool], value: Any) -> bool:
@@ -41,14 +45,19 @@ def is_tuple_of(holds: Callable[[Any], bool], value: Any) -> bool:
     return isinstance(value, tuple) and all(map(holds, value))
 
 
-FINITE = Check("finite in float32", is_finite)
-POSITIVE = Check("finite in float32 and > 0", lambda x: is_finite(x) and x > 0)
+FINITE = Check("a number that float32 can hold", is_finite)
+POSITIVE = Check(
+    "> 0 and a number that float32 can hold", lambda x: is_finite(x) and x > 0
+)
 POSITIVE_OR_NONE = Check(
     f"null, or {POSITIVE.allowed}", lambda x: x is None or POSITIVE.holds(x)
 )
-NOT_NEGATIVE = Check("finite in float32 and >= 0", lambda x: is_finite(x) and x >= 0)
+NOT_NEGATIVE = Check(
+    ">= 0 and a number that float32 can hold", lambda x: is_finite(x) and x >= 0
+)
 COUNT = Check("an integer in [1, 2**31)", lambda x: is_integer(x) and x >= 1)
 NUMBER = Check("an integer in [0, 2**31)", lambda x: is_integer(x) and x >= 0)
+OBJECTS = Check("an integer in [0, 1000]", lambda x: is_integer(x, 1001) and x >= 0)
 SWITCH = Check("true or false", lambda x: isinstance(x, bool))
 DISCOUNT = Check("in (0, 1]", lambda x: is_finite(x) and 0 < x <= 1)
 SHARE = Check("in [0, 1]", lambda x: is_finite(x) and 0 <= x <= 1)
@@ -58,7 +67,7 @@ COUNTS = Check(
     "a tuple of integers in [1, 2**31)", lambda x: is_tuple_of(COUNT.holds, x)
 )
 CORNERS = Check(
-    "(xmin, ymin, xmax, ymax), finite in float32",
+    "(xmin, ymin, xmax, ymax), numbers that float32 can hold",
     lambda x: is_tuple_of(is_finite, x) and len(x) == 4,
 )
 
@@ -79,7 +88,7 @@ def some_of(kind: Any) -> Check:
     known = get_args(kind)
     return Check(
         f"distinct names out of {', '.join(known)}",
-        lambda x: x != () and is_tuple_of(known.__contains__, x) and is_distinct(x),
+        lambda x: is_tuple_of(known.__contains__, x) and x != () and is_distinct(x),
     )
 
 

@@ -14,7 +14,7 @@ from autocost_jax.config.checks import (
     COUNT,
     FINITE,
     NOT_NEGATIVE,
-    NUMBER,
+    OBJECTS,
     POSITIVE,
     POSITIVE_OR_NONE,
     SWITCH,
@@ -71,20 +71,20 @@ class EnvConfig:
     box_null_dist: float = setting(
         0.0, NOT_NEGATIVE, "box sizes; nearer than that nearing it earns nothing"
     )
-    hazards_num: int = setting(4, NUMBER, "how many; ours, Safety Gym has none")
+    hazards_num: int = setting(4, OBJECTS, "how many; ours, Safety Gym has none")
     hazards_size: float = setting(0.3, POSITIVE, "radius")
     hazards_keepout: float = setting(0.4, POSITIVE, "free radius")
     hazards_cost: float = setting(1.0, FINITE, "cost of a step per metre inside")
     observe_hazards: bool = setting(True, SWITCH, "by a lidar")
     constrain_hazards: bool = setting(True, SWITCH, "whether they cost")
-    pillars_num: int = setting(0, NUMBER, "how many")
+    pillars_num: int = setting(0, OBJECTS, "how many")
     pillars_size: float = setting(0.2, POSITIVE, "radius")
     pillars_height: float = setting(0.5, POSITIVE, "half height")
     pillars_keepout: float = setting(0.3, POSITIVE, "free radius")
     pillars_cost: float = setting(1.0, FINITE, "cost of a step in contact")
     observe_pillars: bool = setting(False, SWITCH, "by a lidar")
     constrain_pillars: bool = setting(False, SWITCH, "whether contact costs")
-    vases_num: int = setting(0, NUMBER, "how many")
+    vases_num: int = setting(0, OBJECTS, "how many")
     vases_size: float = setting(0.1, POSITIVE, "half width")
     vases_density: float = setting(0.001, POSITIVE, "mass per volume")
     vases_sink: float = setting(4e-5, NOT_NEGATIVE, "depth in the floor at first")

@@ -41,15 +41,15 @@ SETTINGS = (  # fields of the configuration that have a flag of their own
 )
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """The command line; `argv` defaults to the program's."""
+def main(argv: Sequence[str] | None = None, prog: str = PROG) -> None:
+    """The command line; `argv` defaults to the program's, `prog` is its name."""
     argv = list(sys.argv[1:] if argv is None else argv)
     quiet()
-    guarded(lambda: _main(argv), PROG)
+    guarded(lambda: _main(argv, prog), prog)
 
 
-def _main(argv: list[str]) -> None:
-    options = parse(_options_type(), argv, PROG, description=__doc__)
+def _main(argv: list[str], prog: str) -> None:
+    options = parse(_options_type(), argv, prog, description=__doc__)
     flags = {name: getattr(options, name) for name in SETTINGS}
     base = _base(options)
     config = config_with(base, options.env, flags, options.set)

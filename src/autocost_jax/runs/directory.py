@@ -296,23 +296,23 @@ class RunDir:
             checkpoint.warnings.append(warning)
         return checkpoint
 
-    def lost_files(self, num_stages: int) -> list[str]:
+    def damages(self, num_stages: int) -> list[str]:
         """What of a resumed run is broken and cannot be made again, in words.
 
         Args:
           num_stages: stages that have left their file.
         """
-        lost = []
-        for number in range(num_stages):
+        files = [self.path / f"stage_{number:02d}.npz" for number in range(num_stages)]
+        found = []
+        for read, path in [
+            *((load_arrays, f) for f in files),
+            (read_metrics, self.path),
+        ]:
             try:
-                load_arrays(self.path / f"stage_{number:02d}.npz")
+                read(path)
             except RunDirError as error:
-                lost.append(f"{error}: the run goes on, but gets no report")
-        try:
-            read_metrics(self.path)
-        except RunDirError as error:
-            lost.append(f"{error}: the run goes on, but gets no report")
-        return lost
+                found.append(str(error))
+        return found
 
     def truncate_metrics(self, metrics_bytes: int) -> str | None:
         """Cut metrics.jsonl to a length; returns a warning if it was shorter."""

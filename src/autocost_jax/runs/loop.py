@@ -101,6 +101,7 @@ def compile_ahead(
 
 def keep_chunks(
     run: RunDir | None,
+    path: Path,
     chunks: Iterable[Chunk],
     state: Any,
     fetch: Callable[[Any], Any],
@@ -109,6 +110,7 @@ def keep_chunks(
 
     Args:
       run: the open run directory.
+      path: its place.
       chunks: made as they are asked for.
       state: before the first one.
       fetch: pytree -> the same in this process's memory.
@@ -126,17 +128,16 @@ def keep_chunks(
             if run is not None:
                 for k, row in enumerate(chunk.rows):
                     run.log_metrics(row, chunk.first + k)
-            stop = signal_that_came()
             is_due = time.monotonic() - saved_at >= CHECKPOINT_SECONDS
-            is_due |= chunk.is_end or stop is not None
+            is_due |= chunk.is_end or signal_that_came() is not None
             if is_due or jax.process_count() > 1:  # clocks differ, all must take part
                 saved = state.replace(training=fetch(state.training))
                 if run is not None:
                     after = chunk.first + len(chunk.rows)
                     run.save_checkpoint(saved, after, chunk.position)
                 saved_at = time.monotonic()
-            if stop is not None and run is not None:
-                raise Stopped(stop, run.path)
+                if (signum := signal_that_came()) is not None:
+                    raise Stopped(signum, path)
     return state.replace(training=fetch(state.training))
 
 

@@ -191,7 +191,8 @@ class Display:
 
     def __exit__(self, *exception: Any) -> None:
         if self._live is not None:
-            self._live.__exit__(*exception)
+            with contextlib.suppress(OSError):
+                self._live.__exit__(*exception)
             self._live = None
 
     @contextlib.contextmanager
@@ -211,7 +212,7 @@ class Display:
                 if self._live is None:
                     self.say(line)
                 else:  # one line below the table, redrawn
-                    self._live.update(self._table(line), refresh=True)
+                    self._redraw(line)
 
         def tell(count: int, total: int) -> None:
             done[0] = f"{count} of {total}, "
@@ -227,7 +228,8 @@ class Display:
 
     def say(self, text: str) -> None:
         """A line of its own, above the table."""
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        with contextlib.suppress(OSError):  # a closed terminal is no reason to stop
+            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def start_clock(self) -> None:
         """Called when training starts, after the compile."""
@@ -263,7 +265,7 @@ class Display:
             return
         is_same_stage = self._rows and self._rows[-1][0] == row[0]
         self._rows = (self._rows[:-1] if is_same_stage else self._rows) + [row]
-        self._live.update(self._table(), refresh=True)
+        self._redraw()
 
     def _warn_if_slow(self, left: float) -> None:
         """Once, after the first epochs, if the whole takes longer than was planned."""
@@ -276,6 +278,10 @@ class Display:
                 f"this machine is slower than planned: about {format_seconds(total)} "
                 f"in all instead of {format_seconds(self._planned)}"
             )
+
+    def _redraw(self, caption: str | None = None) -> None:
+        with contextlib.suppress(OSError):
+            self._live.update(self._table(caption), refresh=True)
 
     def _table(self, caption: str | None = None) -> Any:
         from rich.table import Table

@@ -139,6 +139,7 @@ def run_search(
     Raises:
       RunDirError: the directory is not usable for this run.
       DiskFullError: the disk is full; the directory is intact.
+      Stopped: a signal to stop has come; see `keep_chunks`.
       ValueError: the configuration does not fit the devices.
       RuntimeError: every candidate of a stage failed.
     """
@@ -152,6 +153,7 @@ def run_search(
         warnings = run.warnings if run else []
         for line in [*warnings, *describe(config, searcher.env, len(devices))]:
             display.say(line)
+        damages: list[str] = []
         state, resumed = start(run, path, init_search(searcher), display, resume)
         if resumed:
             done = f"{int(state.stage)} stages and {int(state.epoch)} epochs"
@@ -159,16 +161,17 @@ def run_search(
             display.skip(_steps_done(config, state))
             require_survivors(config, state.es)  # before anything is compiled
             num_stages = min(int(state.stage), config.num_stages)
-            for line in run.lost_files(num_stages) if run else ():
-                display.say(line)
+            damages = run.damages(num_stages) if run else []
+            for line in damages:
+                display.say(f"{line}: the run goes on without a report")
         if int(state.stage) < config.total_stages:
             slots = slots_of(searcher, state)
             compile_ahead(searcher.population, state.training, slots, display)
         chunks = _chunks(run, searcher, state, display)
-        state = keep_chunks(run, chunks, state, searcher.population.fetch)
+        state = keep_chunks(run, path, chunks, state, searcher.population.fetch)
         if run is not None:
             finish(run, searcher, state, display, num_episodes)
-            page = write_report(path) if write_report else path
+            page = write_report(path) if write_report and not damages else path
             display.say(f"done in {format_seconds(display.elapsed)}; open {page}")
         cluster.wait_for_all()
 

@@ -22,6 +22,7 @@ from autocost_jax.config import Algorithm, AlgorithmName, TrainConfig
 from autocost_jax.config.checks import (
     FINITE,
     SEED,
+    is_distinct,
     is_finite,
     is_tuple_of,
     one_of,
@@ -124,8 +125,10 @@ class SweepConfig:
     def __post_init__(self) -> None:
         kind, rows = TrainConfig, self.methods
         require(isinstance(self.train, kind), "train", "a TrainConfig", self.train)
-        is_table = rows != () and is_tuple_of(lambda row: isinstance(row, Method), rows)
-        require(is_table, "methods", "a tuple of Methods, one at least", rows)
+        is_table = is_tuple_of(lambda row: isinstance(row, Method), rows)
+        require(
+            is_table and rows != (), "methods", "a tuple of Methods, one at least", rows
+        )
         labels = [method.label for method in rows]
         if len(set(labels)) < len(labels):
             raise ValueError(f"methods must have distinct labels, got {labels}")
@@ -135,10 +138,9 @@ class SweepConfig:
                 "the methods of a table must have cost networks of one size, "
                 f"got {sorted(sizes)} parameters"
             )
-        is_seeds = self.seeds != () and is_tuple_of(SEED.holds, self.seeds)
+        is_seeds = is_tuple_of(SEED.holds, self.seeds) and self.seeds != ()
         allowed = "a tuple of distinct integers in [0, 2**32)"
-        is_distinct = is_seeds and len(set(self.seeds)) == len(self.seeds)
-        require(is_distinct, "seeds", allowed, self.seeds)
+        require(is_seeds and is_distinct(self.seeds), "seeds", allowed, self.seeds)
 
     def group(self, name: str) -> list[tuple[Method, int]]:
         """The slots of one algorithm group, in order."""
@@ -221,6 +223,7 @@ def run_sweep(
     Raises:
       RunDirError: the directory is not usable for this run.
       DiskFullError: the disk is full; the directory is intact.
+      Stopped: a signal to stop has come; see `keep_chunks`.
       ValueError: it does not fit the devices.
     """
     num_episodes = episodes_of(path, resume, num_episodes)
@@ -249,7 +252,7 @@ def run_sweep(
         if int(state.epoch) < config.train.num_epochs:
             compile_ahead(population, state.training, slots, display)
         chunks = _chunks(config, population, slots, state, display)
-        state = keep_chunks(run, chunks, state, population.fetch)
+        state = keep_chunks(run, path, chunks, state, population.fetch)
         table = []
         if run is not None:
             table = _finish(run, env, config, state, display, num_episodes)

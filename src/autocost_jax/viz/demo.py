@@ -11,7 +11,7 @@ import numpy as np
 from autocost_jax.config import AgentConfig, TrainConfig, env_config
 from autocost_jax.costs import load_cost
 from autocost_jax.envs.env import make_env
-from autocost_jax.evaluate import first_recording, watch_first
+from autocost_jax.evaluate import Recording, first_recording, watch_first
 from autocost_jax.population import make_evaluator
 from autocost_jax.records import root_key
 from autocost_jax.runs.policies import load_policies
@@ -44,13 +44,12 @@ def demo_train() -> TrainConfig:
     )
 
 
-def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
-    """Replay CPO's agents under the extrinsic cost alone and under a found cost.
+def play_demo(seed: int, num_episodes: int) -> tuple[list[Recording], list[str]]:
+    """An episode of each shipped policy, in the order of `LABELS`, and their scores.
 
     Args:
-      out: folder of the page.
       seed: of the layouts, which both agents meet, and of the actions.
-      num_episodes: that the scores are of; the first is shown.
+      num_episodes: that the scores are of; the first is recorded.
     """
     train = demo_train()
     env = make_env(train.env)
@@ -61,20 +60,34 @@ def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
         env, agent, num_episodes, keep=first_recording, watch=watch_first
     )
     result, kept = evaluate(states, root_key(seed))
-    theta = np.asarray(load_cost(FOUND))
-    replays, lines = [], []
-    for i, (name, label) in enumerate(LABELS.items()):
-        recording = jax.tree.map(lambda x, i=i: np.asarray(x[i]), kept)
+    recordings = [
+        jax.tree.map(lambda x, i=i: np.asarray(x[i]), kept) for i in range(len(LABELS))
+    ]
+    lines = [
+        f"CPO, {label}: return {float(result.ep_return[i].mean()):.1f}, "
+        f"{float(result.violation_rate[i]):.0%} of {num_episodes} episodes violate"
+        for i, label in enumerate(LABELS.values())
+    ]
+    return recordings, lines
+
+
+def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
+    """Replay CPO's agents under the extrinsic cost alone and under a found cost.
+
+    Args:
+      out: folder of the page.
+      seed: of the layouts, which both agents meet, and of the actions.
+      num_episodes: that the scores are of; the first is shown.
+    """
+    recordings, lines = play_demo(seed, num_episodes)
+    theta, world = np.asarray(load_cost(FOUND)), demo_train().env
+    replays = []
+    for (name, label), recording in zip(LABELS.items(), recordings, strict=True):
         intrinsic = None
         if name == FOUND:
             intrinsic = network_cost(theta, recording.constraint_lidar)
         title = f"CPO, {label}"
-        replay = make_replay(train.env, recording, intrinsic=intrinsic, label=title)
-        replays.append(replay)
-        lines.append(
-            f"{title}: return {float(result.ep_return[i].mean()):.1f}, "
-            f"{float(result.violation_rate[i]):.0%} of {num_episodes} episodes violate"
-        )
+        replays.append(make_replay(world, recording, intrinsic=intrinsic, label=title))
     text = (
         "The same world, the same learner, the same number of steps. Both robots drive "
         "to goals; the discs are hazards, which cost something while one is inside. "

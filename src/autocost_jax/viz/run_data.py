@@ -40,8 +40,8 @@ def load_report(path: str | Path) -> ReportData:
     path = Path(path)
     config, facts = read_config(path, SearchConfig)
     rows = _rows(config, path)
-    files = stage_files(path)
-    stages = tuple(_stage(config, file) for file in files)
+    read = [_stage(config, *each) for each in enumerate(stage_files(path))]
+    stages = tuple(stage for stage, _ in read)
     card = read_object(path / "cost.json")
     best = _best(config, stages, card)
     summary = {} if best is None else read_object(path / "summary.json")
@@ -59,11 +59,7 @@ def load_report(path: str | Path) -> ReportData:
         replays=() if best is None else _replays(path, config),
         summary=_summary(path, summary),
         conclusion=summary.get("conclusion", ""),
-        references=tuple(
-            score
-            for number, file in enumerate(files)
-            for score in _references(config, number, load_arrays(file))
-        ),
+        references=tuple(score for _, scores in read for score in scores),
         can_violate=_can_violate(config, rows),
     )
 
@@ -115,12 +111,20 @@ def _rows(config: SearchConfig, path: Path) -> list[dict[str, Any]]:
     names = [f"{name}/{key}" for name in config.algorithms for key in keys]
     for number, row in enumerate(rows, start=1):
         stage, epoch = row.get("stage"), row.get("epoch")
-        odd = [name for name in names if np.shape(row.get(name)) != (slots,)]
+        odd = [name for name in names if not _is_column(row.get(name), slots)]
         is_known = stage in range(config.total_stages) and isinstance(epoch, int)
         if odd or not is_known:
             what = odd[0] if odd else f"stage {stage!r}, epoch {epoch!r}"
             raise RunDirError(f"{path}: row {number} of its metrics has a bad {what}")
     return rows
+
+
+def _is_column(value: Any, slots: int) -> bool:
+    """Whether a value is a number for each slot."""
+    try:
+        return np.asarray(value, float).shape == (slots,)
+    except (TypeError, ValueError):
+        return False
 
 
 def _summary(path: Path, summary: dict[str, Any]) -> tuple[SummaryRow, ...]:
@@ -136,9 +140,12 @@ def _summary(path: Path, summary: dict[str, Any]) -> tuple[SummaryRow, ...]:
         raise RunDirError(f"{path / 'summary.json'} has a bad row: {error}") from None
 
 
-def _stage(config: SearchConfig, file: Path) -> StageRecord:
+def _stage(
+    config: SearchConfig, number: int, file: Path
+) -> tuple[StageRecord, list[ReferenceScore]]:
+    arrays = load_arrays(file)
     try:
-        return _stage_record(config, load_arrays(file))
+        return _stage_record(config, arrays), _references(config, number, arrays)
     except (KeyError, IndexError) as error:
         raise RunDirError(f"{file} is not the file of a stage: {error}") from None
 
