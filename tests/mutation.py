@@ -1,6 +1,6 @@
 """Do the tests notice faults? Made by hand, one at a time (data/faults.json).
 
-    python tests/mutation.py [--only PART ...]  # writes tests/results/mutation.json
+    python tests/mutation.py [--only PART ...] [--new]  # tests/results/mutation.json
 
 Each fault changes one line of a copy of the source: a sign, an index, an order, a
 dropped weight. The tests of that part of the code must then fail. Takes about half an
@@ -115,12 +115,14 @@ def main() -> None:
     """Every fault, or those of some parts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", help="files below the package")
+    parser.add_argument("--new", action="store_true", help="those never tried")
     args = parser.parse_args()
     known = json.loads(RESULT.read_text())["faults"] if RESULT.exists() else []
     rows = {tuple(row[name] for name in Fault._fields): row for row in known}
     with tempfile.TemporaryDirectory() as folder:
         for fault in FAULTS:
-            if args.only and fault.file not in args.only:
+            is_other = args.only and fault.file not in args.only
+            if is_other or (args.new and tuple(fault) in rows):
                 continue
             row = fault._asdict() | {"noticed": is_noticed(fault, Path(folder))}
             rows[tuple(fault)] = row

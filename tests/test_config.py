@@ -236,7 +236,7 @@ def sizes(config: SearchConfig) -> dict[str, object]:
 # The table of sizes: what each preset promises.
 PROMISED = {
     "laptop": {
-        "candidates": 16,
+        "candidates": 19,
         "elites": 3,
         "stages": 2,
         "init_std": 8.0,
@@ -274,8 +274,8 @@ PROMISED = {
         "nets": (16, 16),
     },
 }
-EPOCHS = {"laptop": 36, "search": 64, "paper": 333, "smoke": 2}
-FITNESS_EPOCHS = {"laptop": 12, "search": 16, "paper": 10, "smoke": 1}
+EPOCHS = {"laptop": 24, "search": 64, "paper": 333, "smoke": 2}
+FITNESS_EPOCHS = {"laptop": 8, "search": 16, "paper": 10, "smoke": 1}
 
 
 @pytest.mark.parametrize("name", PROMISED)

@@ -23,8 +23,9 @@ _LAPTOP_AGENT = AgentConfig(
     violation_factor=1.6,
 )
 
-# Long stages rather than many (`experiments/fitness.py`), a start among costs of which
-# some are useful, mild mutations, and what a user asks for as the measure.
+# Few stages and more finalists (one short training says little of a cost that is near
+# success, `experiments/starts.py`), a start among costs of which many are useful, mild
+# mutations, and what a user asks for as the measure.
 _GUIDED: dict[str, Any] = {
     "start": "graded",
     "init_std": 8.0,
@@ -42,14 +43,14 @@ PRESETS: dict[str, SearchConfig] = {
             env=EnvConfig(physics="closed_form"),
             agent=_LAPTOP_AGENT,
             num_worlds=8,
-            num_epochs=36,
+            num_epochs=24,
             chunk_epochs=2,
         ),
-        population_size=16,
+        population_size=19,
         num_elites=3,
         num_stages=2,
-        fitness_epochs=12,
-        num_finalists=4,
+        fitness_epochs=8,
+        num_finalists=5,
         final_epochs=120,
         **_GUIDED,
     ),

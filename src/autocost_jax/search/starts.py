@@ -8,9 +8,9 @@ from autocost_jax.costs import HIDDEN, intrinsic_logit
 from autocost_jax.records import Key
 
 QUIET_COST = 0.01  # where a cost begins to speak
-QUIET_PLACES = (45.0, 65.0)  # percentiles of typical places at which it may begin
+QUIET_PLACES = (50.0, 64.0)  # percentiles of typical places at which it may begin
 LOUD_PLACE = 85.0  # percentile at which its loudness is set
-LOUD_COSTS = (0.03, 0.4)  # how loud it may be there
+LOUD_COSTS = (0.12, 0.3)  # how loud it may be there
 UNEVEN = 0.25  # relative deviation of a unit's weights: how much directions differ
 
 

@@ -20,6 +20,7 @@ from autocost_jax.viz.report import write_comparison
 from autocost_jax.viz.scene import make_replay
 
 WORLD = "Goal-Hazard-Point"
+EPISODES = 100  # that the scores are of
 FOUND = "lidar_mlp"  # the best shipped cost of this world
 LABELS = {"extrinsic": "extrinsic cost alone", FOUND: f"with the cost {FOUND}"}
 
@@ -71,7 +72,7 @@ def play_demo(seed: int, num_episodes: int) -> tuple[list[Recording], list[str]]
     return recordings, lines
 
 
-def write_demo(out: Path, seed: int = 0, num_episodes: int = 20) -> Demo:
+def write_demo(out: Path, seed: int = 0, num_episodes: int = EPISODES) -> Demo:
     """Replay CPO's agents under the extrinsic cost alone and under a found cost.
 
     Args:
