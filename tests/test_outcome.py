@@ -67,7 +67,7 @@ def test_the_pick_is_the_one_closest_to_success():
 
 
 def test_finalists_are_judged_by_the_last_epochs_of_their_training():
-    config = dataclasses.replace(CONFIG, final_seeds=2)
+    config = dataclasses.replace(CONFIG, final_seeds=2, population_size=16)
     slots = config.slots_per_algorithm
     after = config.epochs_of(config.num_stages)
     values = np.zeros((after + 5, 2, slots))  # rows behind the end are another stage's

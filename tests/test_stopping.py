@@ -46,6 +46,15 @@ def chunks(signum, at, count=5):
         yield Chunk(State(jnp.float32(i)), 2 * i, [{}, {}], {"epoch": 2 * i + 2}, False)
 
 
+@pytest.fixture(autouse=True)
+def heeded():
+    """Whoever started the tests may ignore signals, as a shell in the background does."""
+    before = {s: signal.signal(s, signal.default_int_handler) for s in SIGNALS}
+    yield
+    for signum, handler in before.items():
+        signal.signal(signum, handler)
+
+
 def train(run, chunks):
     return keep_chunks(run, Run.path, chunks, State(jnp.float32(-1)), lambda x: x)
 

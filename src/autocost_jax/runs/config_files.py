@@ -240,36 +240,6 @@ def list_stages(path: str | Path) -> dict[int, Path]:
     return dict(sorted((int(key), file) for key, file in numbered if key.isdecimal()))
 
 
-def stage_files(path: str | Path) -> list[Path]:
-    """The files of a run's stages, from the first on.
-
-    Raises:
-      RunDirError: one of them is missing.
-    """
-    files = list_stages(path)
-    for number, found in enumerate(files):
-        if found != number:
-            raise RunDirError(f"{path}: stage_{number:02d}.npz is missing")
-    return list(files.values())
-
-
-def read_object(file: Path) -> dict[str, Any]:
-    """The object of a JSON file; an empty one if there is no such file.
-
-    Raises:
-      RunDirError: it holds no JSON object.
-    """
-    if not file.exists():
-        return {}
-    try:
-        value = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise RunDirError(f"{file} is not readable: {error}") from None
-    if not isinstance(value, dict):
-        raise RunDirError(f"{file} must hold a JSON object, got {value!r:.40}")
-    return value
-
-
 def to_json(value: Any) -> Any:
     """Strict JSON: arrays as lists, non-finite numbers as strings."""
     if isinstance(value, Mapping):

@@ -17,7 +17,7 @@ from autocost_jax.evaluate import Recording, first_recording, watch_first
 from autocost_jax.files import write_atomic
 from autocost_jax.population import make_evaluator
 from autocost_jax.records import root_key
-from autocost_jax.runs.config_files import read_object
+from autocost_jax.runs.artifacts import read_object
 from autocost_jax.runs.policies import (
     EVALUATION,
     load_policies,

@@ -11,10 +11,9 @@ from autocost_jax.costs import load_cost
 from autocost_jax.es import Fitness, pool, rank
 from autocost_jax.files import RunDirError, load_arrays
 from autocost_jax.population import run_compiled
-from autocost_jax.runs.config_files import read_object, stage_files
+from autocost_jax.runs.artifacts import read_object, read_recording, stage_files
 from autocost_jax.runs.directory import read_config, read_metrics
 from autocost_jax.runs.labels import COST_LABELS, algorithm_label
-from autocost_jax.runs.recordings import read_recording
 from autocost_jax.search.evolution import pick_label
 from autocost_jax.search.stages import REFERENCES, deal
 from autocost_jax.viz.cost_map import network_cost
