@@ -106,6 +106,13 @@ def test_the_same_seed_twice(program, reference):
     assert_same_bits(run(program, groups()), reference)
 
 
+def test_every_epoch_has_random_numbers_of_its_own(program):
+    slots = groups()
+    first, second = (program.chunk(program.init(slots), slots, at)[1] for at in (0, 1))
+    for one, two in zip(first, second, strict=True):
+        assert not np.equal(one["ep_total_cost"], two["ep_total_cost"]).any()
+
+
 def test_permuted_slots(program, reference):
     order = np.array([2, 0, 3, 1])
     permuted = run(program, jax.tree.map(lambda x: x[order], groups()))

@@ -43,9 +43,8 @@ def test_every_command_is_in_the_documents():
     commands = re.findall(r"^  (\w+) ", HELP, re.M)
     assert len(commands) == 9
     for command in commands:
-        assert re.search(rf"^\| .*`autocost {command}\b", DOCS["commands"], re.M), (
-            command
-        )
+        row = rf"^\| .*`autocost {command}\b"
+        assert re.search(row, DOCS["commands"], re.M), command
 
 
 def test_the_readme_is_short():

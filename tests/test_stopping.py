@@ -48,7 +48,7 @@ def chunks(signum, at, count=5):
 
 @pytest.fixture(autouse=True)
 def heeded():
-    """Whoever started the tests may ignore signals, as a shell in the background does."""
+    """Who started the tests may ignore signals, as a shell in the background does."""
     before = {s: signal.signal(s, signal.default_int_handler) for s in SIGNALS}
     yield
     for signum, handler in before.items():
