@@ -324,20 +324,25 @@ def test_killed_and_resumed_is_bit_for_bit_the_same(whole, environment, tmp_path
 def test_a_signal_stops_a_run_within_seconds(whole, environment, tmp_path, signum):
     """`whole` has warmed the compile cache; a checkpoint less old than 15 s is kept."""
     out = tmp_path / "stopped"
-    process = subprocess.Popen(
+    with subprocess.Popen(
         command(out, *SMOKE, "--set", "num_stages=1000"),
         env=environment,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-    )
-    deadline = time.monotonic() + WAIT
-    while len(list(out.glob("stage_*.npz"))) < 3:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    process.send_signal(signum)
-    _, error = process.communicate(timeout=10)
+        # A shell in the background would have them ignored.
+        preexec_fn=lambda: signal.signal(signum, signal.SIG_DFL),
+    ) as process:
+        deadline = time.monotonic() + WAIT
+        try:
+            while len(list(out.glob("stage_*.npz"))) < 3:
+                assert process.poll() is None
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            process.send_signal(signum)
+            _, error = process.communicate(timeout=30)
+        finally:
+            process.kill()
     assert process.returncode == 128 + signum
     assert error.splitlines()[-1].endswith(f"--resume --out {out}")
     rows, stages = read_metrics(out), len(list_stages(out))
