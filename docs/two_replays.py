@@ -50,7 +50,7 @@ def main() -> None:
     recordings, lines = play_demo(SEED, EPISODES)
     figure, axes = plt.subplots(1, 2, figsize=(7, 3.9), layout="constrained")
     for axis, recording, label in zip(axes, recordings, LABELS.values(), strict=True):
-        draw(axis, recording, f"CPO, {label}")
+        draw(axis, recording, label)
     figure.savefig(OUT, dpi=110)
     print("\n".join(lines))
 

@@ -50,7 +50,7 @@ SETTINGS: dict[str, tuple[int, int, dict[str, Any]]] = {
     "32-32, multiplier from 0.5 at 0.01": (8, 1, MILD),
     "and lambda 0.95": (8, 1, SHORT),
     "and a policy that begins all but still": (8, 1, STILL),
-    # Of `laptop` and `search`, which have 3 passes of the critics beside.
+    # The learner of `laptop` and `search`.
     "and a multiplier from 1, a KL bound of 0.03, CPO's violation x 1.6": (8, 1, WIDE),
 }
 OTHERS = "the presets' learner, but a PID multiplier, and FOCOPS for CPO"

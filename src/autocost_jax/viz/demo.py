@@ -22,7 +22,10 @@ from autocost_jax.viz.scene import make_replay
 WORLD = "Goal-Hazard-Point"
 EPISODES = 100  # that the scores are of
 FOUND = "lidar_mlp"  # the best shipped cost of this world
-LABELS = {"extrinsic": "extrinsic cost alone", FOUND: f"with the cost {FOUND}"}
+LABELS = {
+    "extrinsic": "CPO, extrinsic cost alone",
+    FOUND: f"CPO, with the cost {FOUND}",
+}
 
 
 class Demo(NamedTuple):
@@ -65,7 +68,7 @@ def play_demo(seed: int, num_episodes: int) -> tuple[list[Recording], list[str]]
         jax.tree.map(lambda x, i=i: np.asarray(x[i]), kept) for i in range(len(LABELS))
     ]
     lines = [
-        f"CPO, {label}: return {float(result.ep_return[i].mean()):.1f}, "
+        f"{label}: return {float(result.ep_return[i].mean()):.1f}, "
         f"{float(result.violation_rate[i]):.0%} of {num_episodes} episodes violate"
         for i, label in enumerate(LABELS.values())
     ]
@@ -87,8 +90,7 @@ def write_demo(out: Path, seed: int = 0, num_episodes: int = EPISODES) -> Demo:
         intrinsic = None
         if name == FOUND:
             intrinsic = network_cost(theta, recording.constraint_lidar)
-        title = f"CPO, {label}"
-        replays.append(make_replay(world, recording, intrinsic=intrinsic, label=title))
+        replays.append(make_replay(world, recording, intrinsic=intrinsic, label=label))
     text = (
         "The same world, the same learner, the same number of steps. Both robots drive "
         "to goals; the discs are hazards, which cost something while one is inside. "

@@ -247,11 +247,13 @@ def _replays(path: Path, config: SearchConfig) -> tuple[Replay, ...]:
             if not file.exists():
                 continue
             recording = read_recording(file)
-            seen = network_cost(theta, recording.constraint_lidar)
+            intrinsic = None
+            if kind == "best":
+                intrinsic = network_cost(theta, recording.constraint_lidar)
             replay = make_replay(
                 config.train.env,
                 recording,
-                intrinsic=seen if kind == "best" else None,
+                intrinsic=intrinsic,
                 label=f"{algorithm_label(name)}, {COST_LABELS[kind]}",
             )
             replays.append(replay)
