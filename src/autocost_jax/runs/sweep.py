@@ -8,7 +8,7 @@ slot and their scores over fresh episodes.
 import re
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,11 +22,13 @@ from autocost_jax.config import Algorithm, AlgorithmName, TrainConfig
 from autocost_jax.config.checks import (
     FINITE,
     SEED,
+    Check,
+    check_fields,
     is_distinct,
     is_finite,
     is_tuple_of,
     one_of,
-    require,
+    setting,
 )
 from autocost_jax.costs import parse_cost, training_cost
 from autocost_jax.envs.env import Env, make_env
@@ -66,7 +68,26 @@ from autocost_jax.runs.progress import Display, format_seconds
 from autocost_jax.train import EpochState
 
 GROUPS: tuple[Algorithm, ...] = get_args(Algorithm)
-FILE_NAME = r"[^./\\\0-\x1f][^/\\\0-\x1f]{0,99}"
+LABEL = Check(
+    "the name of a file, of at most 100 characters and not with a dot first",
+    lambda x: (
+        isinstance(x, str)
+        and bool(re.fullmatch(r"[^./\\\0-\x1f][^/\\\0-\x1f]{0,99}", x))
+    ),
+)
+TERMS = Check("terms of the bank", lambda x: isinstance(x, str))
+THETA = Check(
+    "null or a tuple of finite numbers",
+    lambda x: x is None or is_tuple_of(is_finite, x),
+)
+ROWS = Check(
+    "a tuple of Methods, one at least",
+    lambda x: is_tuple_of(lambda row: isinstance(row, Method), x) and x != (),
+)
+SEEDS = Check(
+    "a tuple of distinct integers in [0, 2**32)",
+    lambda x: is_tuple_of(SEED.holds, x) and x != () and is_distinct(x),
+)
 
 
 @dataclass(frozen=True)
@@ -81,24 +102,16 @@ class Method:
       theta: the intrinsic network's parameters, if `cost` uses it.
     """
 
-    label: str
-    algorithm: AlgorithmName = "ppo_lagrangian"
-    cost: str = "extrinsic"
-    limit: float = 0.0
-    theta: tuple[float, ...] | None = None
+    label: str = setting(MISSING, LABEL, "its name in files and tables")
+    algorithm: AlgorithmName = setting(
+        "ppo_lagrangian", one_of(AlgorithmName), "that trains it"
+    )
+    cost: str = setting("extrinsic", TERMS, "the training cost")
+    limit: float = setting(0.0, FINITE, "allowed training cost per episode")
+    theta: tuple[float, ...] | None = setting(None, THETA, "of the intrinsic network")
 
     def __post_init__(self) -> None:
-        is_name = isinstance(self.label, str) and re.fullmatch(FILE_NAME, self.label)
-        allowed = (
-            "the name of a file, of at most 100 characters and not with a dot first"
-        )
-        require(bool(is_name), "label", allowed, self.label)
-        names = one_of(AlgorithmName)
-        require(names.holds(self.algorithm), "algorithm", names.allowed, self.algorithm)
-        require(isinstance(self.cost, str), "cost", "terms of the bank", self.cost)
-        require(FINITE.holds(self.limit), "limit", FINITE.allowed, self.limit)
-        is_theta = self.theta is None or is_tuple_of(is_finite, self.theta)
-        require(is_theta, "theta", "null or a tuple of finite numbers", self.theta)
+        check_fields(self)
         theta = None if self.theta is None else np.asarray(self.theta)
         parse_cost(self.cost, theta, self.limit)
 
@@ -119,17 +132,12 @@ class SweepConfig:
     """
 
     train: TrainConfig = field(default_factory=TrainConfig)
-    methods: tuple[Method, ...] = ()
-    seeds: tuple[int, ...] = (0,)
+    methods: tuple[Method, ...] = setting((), ROWS, "what is trained")
+    seeds: tuple[int, ...] = setting((0,), SEEDS, "of each method")
 
     def __post_init__(self) -> None:
-        kind, rows = TrainConfig, self.methods
-        require(isinstance(self.train, kind), "train", "a TrainConfig", self.train)
-        is_table = is_tuple_of(lambda row: isinstance(row, Method), rows)
-        require(
-            is_table and rows != (), "methods", "a tuple of Methods, one at least", rows
-        )
-        labels = [method.label for method in rows]
+        check_fields(self)
+        labels = [method.label for method in self.methods]
         if len(set(labels)) < len(labels):
             raise ValueError(f"methods must have distinct labels, got {labels}")
         sizes = {len(row.theta) for row in self.methods if row.theta is not None}
@@ -138,9 +146,6 @@ class SweepConfig:
                 "the methods of a table must have cost networks of one size, "
                 f"got {sorted(sizes)} parameters"
             )
-        is_seeds = is_tuple_of(SEED.holds, self.seeds) and self.seeds != ()
-        allowed = "a tuple of distinct integers in [0, 2**32)"
-        require(is_seeds and is_distinct(self.seeds), "seeds", allowed, self.seeds)
 
     def group(self, name: str) -> list[tuple[Method, int]]:
         """The slots of one algorithm group, in order."""
